@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium ci-extra peers names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
+.PHONY: aravis chromium ci-extra peers third-party names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
 
 setup: $(STAMP)
 
@@ -51,6 +51,11 @@ aravis:
 peers: $(STAMP)
 	scripts/install-peers $(BIN)/python
 
+# Simulators of third parties, for `python -m evaluation third-party`; tests that need them skip without them.
+third-party: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[third-party]'
+	rm -rf calibench.egg-info  # as above
+
 # The browser in which the tests drive the operator's page, from the distribution.
 chromium:
 	scripts/install-chromium
@@ -77,8 +82,8 @@ PROOF ?= calibench-data/proof
 proof: $(STAMP)
 	mkdir -p $(dir $(PROOF))
 	test -s $(PROOF).seed || $(BIN)/python -c "import random; print($(if $(SEED),$(SEED),random.SystemRandom().randrange(10**6, 2**32)))" > $(PROOF).seed
-	test -f $(PROOF).score.json || $(BIN)/calibench challenge make --proof --out $(PROOF) --cases $(CASES) --seed "$$(cat $(PROOF).seed)"
-	$(BIN)/calibench challenge score $(PROOF) --truths $(PROOF).truths.json --json $(PROOF).score.json --page docs/proof.md
+	test -f $(PROOF).score.json || $(BIN)/python -m evaluation make --proof --out $(PROOF) --cases $(CASES) --seed "$$(cat $(PROOF).seed)"
+	$(BIN)/python -m evaluation score $(PROOF) --truths $(PROOF).truths.json --json $(PROOF).score.json --page docs/proof.md
 
 # A blind proof of discovery, of laws that no list has: goes on where it stopped; a new one needs another UNLISTED.
 UNLISTED_CASES ?= 200
@@ -86,20 +91,20 @@ UNLISTED ?= calibench-data/proof-unlisted
 proof-unlisted: $(STAMP)
 	mkdir -p $(dir $(UNLISTED))
 	test -s $(UNLISTED).seed || $(BIN)/python -c "import random; print($(if $(SEED),$(SEED),random.SystemRandom().randrange(10**6, 2**32)))" > $(UNLISTED).seed
-	test -f $(UNLISTED).score.json || $(BIN)/calibench challenge make --unlisted --proof --out $(UNLISTED) --cases $(UNLISTED_CASES) --seed "$$(cat $(UNLISTED).seed)"
-	$(BIN)/calibench challenge score $(UNLISTED) --truths $(UNLISTED).truths.json --json $(UNLISTED).score.json --page docs/proof-unlisted.md
+	test -f $(UNLISTED).score.json || $(BIN)/python -m evaluation make --unlisted --proof --out $(UNLISTED) --cases $(UNLISTED_CASES) --seed "$$(cat $(UNLISTED).seed)"
+	$(BIN)/python -m evaluation score $(UNLISTED) --truths $(UNLISTED).truths.json --json $(UNLISTED).score.json --page docs/proof-unlisted.md
 
 # The live proof: benches that conceal each effect, a session over the wire of each, and the diagnosis. Goes on where it stopped;
 # ARGS="--only CASE" runs one.
 LIVE ?= calibench-data/proof-live
 proof-live: $(STAMP)
-	$(BIN)/python -m lab.challenge.live --out $(LIVE) --page docs/proof.md $(ARGS)
+	$(BIN)/python -m evaluation live --out $(LIVE) --page docs/proof.md $(ARGS)
 
-# False names: quick sessions of the default bench, healthy cameras, strong effects and blurs of the second former. Goes on where it
-# stopped; ARGS="--only bench --most 5" runs a part.
+# False names: quick sessions of the default bench, healthy cameras, strong effects and blurs of the independent simulator. Goes on
+# where it stopped; ARGS="--only bench --most 5" runs a part.
 NAMES ?= calibench-data/names
 names: $(STAMP)
-	$(BIN)/python -m lab.challenge.names --out $(NAMES) $(ARGS)
+	$(BIN)/python -m evaluation names --out $(NAMES) $(ARGS)
 
 # Real recordings through import, fit and diagnose, beside what is known of them by other means: docs/real-recordings.md, compared with
 # its last state. Goes on where it stopped; ARGS="--only SET" runs one, ARGS="--more DIR" takes the sets of another folder.
@@ -111,7 +116,7 @@ real: $(STAMP)
 # CASE" runs one, another SEED draws cameras that nobody has seen. Then the highest levels of real photon-transfer sets from the lowest.
 TWIN ?= calibench-data/proof-twin
 twin: $(STAMP)
-	$(BIN)/python -m lab.challenge.transfers --out $(TWIN) $(if $(SEED),--seed $(SEED)) --page docs/proof-twin.md $(ARGS)
+	$(BIN)/python -m evaluation twin --out $(TWIN) $(if $(SEED),--seed $(SEED)) --page docs/proof-twin.md $(ARGS)
 	test ! -d $(REAL) || $(BIN)/python -m benchmarks.real.extrapolation --data $(REAL) --page docs/proof-twin.md
 
 # The tests that the everyday suite leaves out: recovery and coverage over many draws.

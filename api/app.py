@@ -32,12 +32,12 @@ from api.room_watch import RoomWatch
 from api.routes import (
     calibrations,
     camera_models,
-    challenges,
     findings,
     jobs,
     knowledge,
     queue,
     recordings,
+    removed,
     sessions,
     twin,
 )
@@ -63,7 +63,6 @@ from lab.capture.recovery import Recovery
 from lab.capture.session import Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
-from lab.challenge.kept import Challenges
 from lab.errors import CannotWrite, InputError, one_line
 from lab.jobs import JobRunner
 from lab.quick_look.process import QuickLook
@@ -90,7 +89,6 @@ TAGS = [
         "comparisons.",
     },
     {"name": "twin", "description": "Predictions before the capture, sealed; their scores, and budgets."},
-    {"name": "challenges", "description": "Concealed-effect data with sealed truths, and its scoring."},
     {"name": "knowledge", "description": "What the models know."},
 ]
 #: Statuses that the service answers before a route is asked: a foreign Host, a method that the path hasn't, a body that
@@ -292,7 +290,6 @@ def create_app(
         pictures=Pictures(store, inbox),
         jobs=jobs_of,
         inbox=inbox,
-        challenges=Challenges(store.root / "challenges"),
         gate=gate,
         public=app.state.public,
         limits=caps,
@@ -308,7 +305,7 @@ def create_app(
     app.include_router(open_to_all)
     strict = [Depends(check_query)]
     app.include_router(stations_router, prefix=PREFIX, dependencies=strict)
-    parts = (knowledge, sessions, queue, recordings, jobs, findings, calibrations, camera_models, challenges, twin)
+    parts = (knowledge, sessions, queue, recordings, jobs, findings, calibrations, camera_models, twin, removed)
     for part in parts:
         app.include_router(part.router, prefix=PREFIX, dependencies=strict)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]

@@ -1,16 +1,21 @@
-"""A client of the REST service, typed with the service's own schemas.
+"""A client of the REST service: `calibench.connect`.
 
-    with ServiceClient("http://127.0.0.1:8000", key) as client:
+    with connect("http://127.0.0.1:8000", key) as client:
         session = client.capture("bench", quick=True, sequences=("dark", "flat"))
-        fit = client.fit(session.id)
+        fit = client.fit(session)
 
-Needs httpx: calibench's extra `test`.
+Its types are the classes that the service's OpenAPI document is made from (`api.schemas` and the results): there is one
+list of them, and a test compares every method with the document. While a session or a job runs, a bar shows how far
+it is. What the service refuses is an exception with the service's one line.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
+import os
 import secrets
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
@@ -21,16 +26,12 @@ from typing import Any, Literal, Self, TypeVar
 import httpx
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, TypeAdapter
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from api.certificate import Certificate
 from api.schemas import (
     CalibrationDetail,
     CameraModels,
     Certify,
-    Challenge,
-    ChallengeJobStart,
-    ChallengeStart,
     Comparison,
     ConnectedDevice,
     DeviceCheck,
@@ -72,22 +73,29 @@ from lab.calibration.limits import CalibrationLimits
 from lab.capture.catalogue import PlanEstimate, SequenceDescription
 from lab.capture.plan import Parameters
 from lab.capture.session import Progress
-from lab.challenge.score import ChallengeScore
-from lab.challenge.truth import Truths
 from lab.diagnose.visibility import EffectDescription, ParameterDescription
+from lab.errors import InputError, one_line
+from lab.formats.recording_set import RecordingSet, archive, read
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
+from lab.progress_bar import progress_bar
 from lab.quick_look.curves import Curves, FrameFigures
+from lab.report.certificate import Certificate
 from lab.report.findings import DiagnosisFindings
 from lab.twin.budget import BudgetResult
 from lab.twin.score import TwinScore
 from sim.camera import Side
 
 M = TypeVar("M", bound=BaseModel)
+T = TypeVar("T")
 W = TypeVar("W", SessionDetail, Job)
+#: What work is done on: a session or recordings that were sent in; a text is a session's id.
+Source = str | StoredSession | Recordings
 #: How often (s) a client that waits looks, and how long it waits unless it is told.
 LOOK_S, PATIENCE_S = 0.2, 600.0
 #: How long (s) a stream of events may be silent: it says something every 15 s.
 EVENTS_S = 60.0
+#: Where a service is that runs on this computer.
+HERE = "http://127.0.0.1:8000"
 
 
 class ServiceProblem(Exception):
@@ -98,6 +106,59 @@ class ServiceProblem(Exception):
         self.status, self.detail = status, detail
 
 
+class ServiceUnreachable(httpx.TransportError):
+    """The service isn't reached, or the connection broke: where, why and the remedy, in one line."""
+
+
+class OtherVersion(ServiceProblem):
+    """The service's answer isn't one of this version of calibench."""
+
+
+class _Connection(httpx.Client):
+    """Connections whose failures are one line with a remedy."""
+
+    def send(self, request: httpx.Request, **options: Any) -> httpx.Response:
+        with _reached(str(self.base_url.copy_with(path="/"))):
+            return super().send(request, **options)
+
+
+@contextlib.contextmanager
+def _reached(url: str) -> Iterator[None]:
+    """Raise ServiceUnreachable where httpx doesn't reach the service, or loses it while an answer arrives."""
+    try:
+        yield
+    except ServiceUnreachable:
+        raise
+    except httpx.TimeoutException as error:
+        raise ServiceUnreachable(
+            f"{url}: no answer in time ({type(error).__name__}); look after the service"
+        ) from error
+    except httpx.TransportError as error:
+        raise ServiceUnreachable(
+            f"{url}: {one_line(error)}; start `calibench serve` there, or correct the address"
+        ) from error
+
+
+def _read(model: type[M], content: bytes | str) -> M:
+    """Return an answer in its type. Raises OtherVersion where it isn't of that type."""
+    return _understood(lambda: model.model_validate_json(content))
+
+
+def _read_list(model: type[M], content: bytes) -> list[M]:
+    """Return the items of an answer. Raises as `_read`."""
+    return _understood(lambda: TypeAdapter(list[model]).validate_json(content))  # type: ignore[valid-type]
+
+
+def _understood(parse: Callable[[], T]) -> T:
+    try:
+        return parse()
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in (error.title, *first["loc"]))
+        remedy = "install the version of calibench that the service has"
+        raise OtherVersion(200, f"the answer isn't of this version ({where}: {first['msg']}); {remedy}") from error
+
+
 def _problem(response: httpx.Response) -> ServiceProblem:
     try:
         detail = str(response.json()["detail"])
@@ -106,14 +167,58 @@ def _problem(response: httpx.Response) -> ServiceProblem:
     return ServiceProblem(response.status_code, detail)
 
 
+def _id_of(source: Source) -> str:
+    return source if isinstance(source, str) else source.id
+
+
+def _standing(of: SessionDetail | Job) -> tuple[str, float]:
+    """Return what is under way, and the share of the work that is done."""
+    if isinstance(of, Job):
+        return of.message or f"{of.kind} {of.state}", of.progress
+    return f"session {of.state}", of.steps_done / max(of.steps, 1)
+
+
+def connect(
+    url: str = HERE, key: str | None = None, *, progress: bool | None = None, timeout_s: float = 30.0
+) -> ServiceClient:
+    """Connect to a service, and look whether it takes the key.
+
+    url : address of the service, `http://HOST:PORT`
+    key : a key of the service (`calibench keys create`); None: what CALIBENCH_KEY says
+    progress : show a bar while a session or a job runs; None: on a terminal and in a notebook
+    timeout_s : how long the service may take for an answer
+
+    Returns the client; use it as a context manager, or `close` it. Raises InputError without a key, ServiceUnreachable
+    where nothing answers, ServiceProblem where the key isn't valid.
+
+    >>> import calibench
+    >>> calibench.connect("http://127.0.0.1:1", "calibench_none")
+    Traceback (most recent call last):
+        ...
+    api.client.ServiceUnreachable: http://127.0.0.1:1/: [Errno 111] Connection refused; start `calibench serve` there, \
+or correct the address
+    """
+    key = os.environ.get("CALIBENCH_KEY", "") if key is None else key
+    if not key:
+        raise InputError("connect: no key; give one that `calibench keys create` printed, or set CALIBENCH_KEY")
+    client = ServiceClient(url.rstrip("/"), key, timeout_s, progress=progress)
+    try:
+        client.me()
+    except BaseException:
+        client.close()
+        raise
+    return client
+
+
 class ServiceClient:
     """The service at `url`, with a key. Every method raises ServiceProblem where the service refuses,
-    httpx.TransportError where it isn't reached, and those that wait TimeoutError."""
+    ServiceUnreachable where it isn't reached, and those that wait TimeoutError. `progress`: of those that wait, show a
+    bar; None: on a terminal and in a notebook."""
 
-    def __init__(self, url: str, key: str, timeout_s: float = 30.0) -> None:
-        self.url = url
+    def __init__(self, url: str, key: str, timeout_s: float = 30.0, *, progress: bool | None = None) -> None:
+        self.url, self.progress = url, progress
         headers = {"Authorization": f"Bearer {key}"}
-        self.http = httpx.Client(base_url=f"{url}/api/v1", headers=headers, timeout=timeout_s, trust_env=False)
+        self.http = _Connection(base_url=f"{url}/api/v1", headers=headers, timeout=timeout_s, trust_env=False)
 
     def __enter__(self) -> Self:
         return self
@@ -143,7 +248,11 @@ class ServiceClient:
         or not at all."""
         partial = file.with_name(f".{file.name}.partial")
         try:
-            with self.http.stream("GET", f"{path}{file.suffix or '.zip'}") as response, partial.open("wb") as to:
+            with (
+                _reached(self.url),
+                self.http.stream("GET", f"{path}{file.suffix or '.zip'}") as response,
+                partial.open("wb") as to,
+            ):
                 if response.is_error:
                     response.read()
                     raise _problem(response)
@@ -155,11 +264,11 @@ class ServiceClient:
         return file
 
     def _get(self, model: type[M], path: str, **params: Any) -> M:
-        return model.model_validate_json(self.request("GET", path, params=params).content)
+        return _read(model, self.request("GET", path, params=params).content)
 
     def _post(self, model: type[M], path: str, body: BaseModel | None = None) -> M:
         content = {} if body is None else {"json": body.model_dump(mode="json")}
-        return model.model_validate_json(self.request("POST", path, **content).content)
+        return _read(model, self.request("POST", path, **content).content)
 
     def _send(self, model: type[M], path: str, archive: Path, **params: Any) -> M:
         """Send a .zip, .tar or .tar.gz piece by piece: it may be larger than the memory."""
@@ -167,12 +276,12 @@ class ServiceClient:
         headers = {"Content-Type": sent, "Content-Length": str(archive.stat().st_size)}
         with archive.open("rb") as file:
             response = self.request("POST", path, content=file, headers=headers, params=params)
-        return model.model_validate_json(response.content)
+        return _read(model, response.content)
 
     def _events(self, path: str) -> Iterator[tuple[str, str]]:
         """(name, data) of each event of a stream, as it arrives."""
         name = ""
-        with self.http.stream("GET", path, timeout=EVENTS_S) as response:
+        with _reached(self.url), self.http.stream("GET", path, timeout=EVENTS_S) as response:
             if response.is_error:
                 response.read()
                 raise _problem(response)
@@ -187,10 +296,9 @@ class ServiceClient:
 
     def _pages(self, model: type[M], path: str, **params: Any) -> Iterator[M]:
         """All items of a list, page by page."""
-        items = TypeAdapter(list[model])  # type: ignore[valid-type]
         response = self.request("GET", path, params=params)
         while True:
-            yield from items.validate_json(response.content)
+            yield from _read_list(model, response.content)
             following = response.links.get("next", {}).get("url")
             if following is None:
                 return
@@ -200,24 +308,26 @@ class ServiceClient:
         """Return what `look` finds once its state is one of `ends`. Raises ServiceProblem unless that is the first of
         them, the good one."""
         until = time.monotonic() + patience_s
-        while (found := look()).state not in ends:
-            if time.monotonic() > until:
-                raise TimeoutError(f"after {patience_s:g} s: {found!r}")
-            time.sleep(LOOK_S)
+        with progress_bar(self.progress) as advance:
+            while (found := look()).state not in ends:
+                if time.monotonic() > until:
+                    raise TimeoutError(f"after {patience_s:g} s: {what} is {found.state}")
+                advance(*_standing(found))
+                time.sleep(LOOK_S)
         if found.state != ends[0]:
             raise ServiceProblem(409, f"{what} is {found.state}: {found.error}")
         return found
 
     def health(self) -> Health:
         """Return whether the service is up, and its version."""
-        return Health.model_validate_json(self.http.get(f"{self.url}/health").raise_for_status().content)
+        return _read(Health, self.http.get(f"{self.url}/health").raise_for_status().content)
 
     def ready(self) -> Health:
         """Return whether the service can work: its registry answers, its data folder takes files."""
         response = self.http.get(f"{self.url}/healthz")
         if response.is_error:
             raise _problem(response)
-        return Health.model_validate_json(response.content)
+        return _read(Health, response.content)
 
     def metrics(self) -> str:
         """Requests, sessions and jobs, as Prometheus reads them."""
@@ -270,13 +380,13 @@ class ServiceClient:
 
     def put_back(self, station: str) -> StationState:
         """Say that what sessions left changed by hand on a station is put back."""
-        return StationState.model_validate_json(self.request("POST", f"/stations/{station}/put-back").content)
+        return _read(StationState, self.request("POST", f"/stations/{station}/put-back").content)
 
     def start_checks(self, station: str, *, transcript: bool = False) -> list[DeviceState]:
         """Let every instrument of a station work once, one after the other, in the background."""
         body = DeviceCheck(transcript=transcript).model_dump(mode="json")
         response = self.request("POST", f"/stations/{station}/check", json=body)
-        return TypeAdapter(list[DeviceState]).validate_json(response.content)
+        return _read_list(DeviceState, response.content)
 
     def transcript(self, station: str, device: str) -> str:
         """Return what went over an instrument's wire in the latest check that kept it."""
@@ -310,7 +420,7 @@ class ServiceClient:
         """Give a session another name, or other notes."""
         body = SessionWords(name=name, notes=notes).model_dump(mode="json")
         response = self.request("PATCH", f"/sessions/{session_id}", json=body)
-        return StoredSession.model_validate_json(response.content)
+        return _read(StoredSession, response.content)
 
     def session_request(self, session_id: str) -> SessionStart:
         """Return what a session was asked to start with."""
@@ -319,7 +429,7 @@ class ServiceClient:
     def change_request(self, session_id: str, start: SessionStart) -> StoredSession:
         """Let another session take the place of one that waits in the queue and never ran."""
         response = self.request("PUT", f"/sessions/{session_id}/request", json=start.model_dump(mode="json"))
-        return StoredSession.model_validate_json(response.content)
+        return _read(StoredSession, response.content)
 
     def queue(self) -> list[QueueEntry]:
         """Return the sessions that wait for their instruments, in their order."""
@@ -329,12 +439,12 @@ class ServiceClient:
         """Let a session wait for its turn, move one that waits, or release one that is held; the queue then."""
         body = (asked or QueuePlace()).model_dump(mode="json")
         response = self.request("PUT", f"/sessions/{session_id}/queue", json=body)
-        return TypeAdapter(list[QueueEntry]).validate_json(response.content)
+        return _read_list(QueueEntry, response.content)
 
     def unqueue_session(self, session_id: str) -> list[QueueEntry]:
         """Take a session out of the queue; the queue then."""
         response = self.request("DELETE", f"/sessions/{session_id}/queue")
-        return TypeAdapter(list[QueueEntry]).validate_json(response.content)
+        return _read_list(QueueEntry, response.content)
 
     def confirm(self, session_id: str, target: str, since: datetime | None = None) -> StoredSession:
         """Say that what a session waits for an operator to do (its `asks`) is done."""
@@ -393,7 +503,7 @@ class ServiceClient:
     def follow_session(self, session_id: str) -> Iterator[StoredSession | Progress]:
         """Yield a session's state and progress as they change, until its run is over."""
         for name, data in self._events(f"/sessions/{session_id}/events"):
-            yield (Progress if name == "progress" else StoredSession).model_validate_json(data)
+            yield _read(Progress, data) if name == "progress" else _read(StoredSession, data)
 
     def stored_capture(self, session_id: str, capture_id: int) -> StoredCapture:
         """One capture."""
@@ -434,11 +544,18 @@ class ServiceClient:
 
     # --- recordings and jobs ------------------------------------------------------------------------------------------
 
-    def send_recordings(self, archive: Path, asked: SentAs | None = None) -> Recordings:
-        """Send in a recording set, a .zip, .tar or .tar.gz; with `asked`, recordings of another format, which become
-        one."""
+    def send_recordings(self, recordings: RecordingSet | str | Path, asked: SentAs | None = None) -> Recordings:
+        """Send in a recording set: the set, its folder, or a .zip, .tar or .tar.gz of it; with `asked`, an archive of
+        recordings of another format, which become one."""
         stated = {} if asked is None else asked.model_dump(mode="json", exclude_unset=True)
-        return self._send(Recordings, "/recordings", archive, **stated)
+        if not isinstance(recordings, RecordingSet) and not Path(recordings).is_dir():
+            return self._send(Recordings, "/recordings", Path(recordings), **stated)
+        opened = recordings if isinstance(recordings, RecordingSet) else read(recordings)
+        with tempfile.TemporaryDirectory(prefix="calibench-") as folder:
+            packed = Path(folder) / "recordings.tar"
+            with packed.open("wb") as file:
+                file.writelines(archive(opened, "tar"))
+            return self._send(Recordings, "/recordings", packed, **stated)
 
     def recordings(self) -> Iterator[Recordings]:
         """All recording sets that were sent in, the newest first."""
@@ -501,7 +618,7 @@ class ServiceClient:
     def follow_job(self, job_id: str) -> Iterator[Job]:
         """Yield a job as it changes, until it is over."""
         for _, data in self._events(f"/jobs/{job_id}/events"):
-            yield Job.model_validate_json(data)
+            yield _read(Job, data)
 
     def start_pipeline(self, start: PipelineStart) -> Job:
         """Start a session and the whole pipeline on it."""
@@ -523,21 +640,22 @@ class ServiceClient:
         """Wait until a job is over. Raises ServiceProblem unless it is done."""
         return self._ended(f"job {job_id}", lambda: self.job(job_id), ("done", "failed", "cancelled"), patience_s)
 
-    def _made(self, model: type[M], kind: JobKind, session_id: str, patience_s: float) -> M:
-        job = self.wait_job(self.start_job(kind, session_id).id, patience_s)
+    def _made(self, model: type[M], kind: JobKind, source: Source, patience_s: float) -> M:
+        start = self.start_recordings_job if isinstance(source, Recordings) else self.start_job
+        job = self.wait_job(start(kind, _id_of(source)).id, patience_s)
         return self._get(model, f"/jobs/{job.id}/result")
 
-    def fit(self, session_id: str, patience_s: float = PATIENCE_S) -> FitResult:
-        """Fit a finished session."""
-        return self._made(FitResult, "fit", session_id, patience_s)
+    def fit(self, source: Source, patience_s: float = PATIENCE_S) -> FitResult:
+        """Fit a finished session, or recordings that were sent in, and wait for the result."""
+        return self._made(FitResult, "fit", source, patience_s)
 
-    def validate(self, session_id: str, patience_s: float = PATIENCE_S) -> ValidationResult:
-        """Validate a finished session's fit."""
-        return self._made(ValidationResult, "validate", session_id, patience_s)
+    def validate(self, source: Source, patience_s: float = PATIENCE_S) -> ValidationResult:
+        """Validate the fit of a finished session, or of recordings, and wait for the result."""
+        return self._made(ValidationResult, "validate", source, patience_s)
 
-    def diagnose(self, session_id: str, patience_s: float = PATIENCE_S) -> DiagnosisResult:
-        """Diagnose a finished session."""
-        return self._made(DiagnosisResult, "diagnose", session_id, patience_s)
+    def diagnose(self, source: Source, patience_s: float = PATIENCE_S) -> DiagnosisResult:
+        """Diagnose a finished session, or recordings that were sent in, and wait for the result."""
+        return self._made(DiagnosisResult, "diagnose", source, patience_s)
 
     def findings(self, session_id: str) -> DiagnosisFindings:
         """Return what a session's newest diagnosis found, in words."""
@@ -554,40 +672,6 @@ class ServiceClient:
     def report(self, job_id: str) -> str:
         """Return the page of a job of the kind `report` or `pipeline`."""
         return self.request("GET", f"/jobs/{job_id}/report").text
-
-    # --- challenges ---------------------------------------------------------------------------------------------------
-
-    def make_challenge(self, start: ChallengeStart) -> Job:
-        """Make a challenge; the job's `challenge_id` is the challenge."""
-        return self._post(Job, "/challenges", start)
-
-    def start_challenge_job(self, kind: Literal["make", "score"], challenge_id: str) -> Job:
-        """Go on making a challenge, or score it."""
-        return self._post(Job, f"/challenges/{challenge_id}/jobs", ChallengeJobStart(kind=kind))
-
-    def challenges(self) -> Iterator[Challenge]:
-        """All challenges, the newest first."""
-        return self._pages(Challenge, "/challenges")
-
-    def challenge(self, challenge_id: str) -> Challenge:
-        """One challenge."""
-        return self._get(Challenge, f"/challenges/{challenge_id}")
-
-    def fetch_case(self, challenge_id: str, case: str, file: Path) -> Path:
-        """Write the recordings of a case to `file`, a .zip or .tar of a recording set."""
-        return self._fetched(f"/challenges/{challenge_id}/cases/{case}/archive", file)
-
-    def challenge_score(self, challenge_id: str) -> ChallengeScore:
-        """Return the score of a challenge that is scored."""
-        return self._get(ChallengeScore, f"/challenges/{challenge_id}/score")
-
-    def challenge_truths(self, challenge_id: str) -> Truths:
-        """Return the truths of a challenge that is scored."""
-        return self._get(Truths, f"/challenges/{challenge_id}/truths")
-
-    def delete_challenge(self, challenge_id: str) -> None:
-        """Delete a challenge for ever."""
-        self.request("DELETE", f"/challenges/{challenge_id}")
 
     # --- calibrations -------------------------------------------------------------------------------------------------
 

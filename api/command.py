@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from api.keys import Permission, check_bind, create_key, is_loopback, stored_keys
+from lab.capture.data_folder import open_store, store_to_read
 from lab.cli.console import Terminated
-from lab.cli.sources import open_store, store_to_read
 from lab.errors import InputError, NoRoom
 
 if TYPE_CHECKING:

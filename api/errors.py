@@ -63,6 +63,7 @@ _MEANINGS = {
     404: "there is no such thing",
     405: "not this method; `Allow` names those of the path",
     409: "conflicts with what is under way",
+    410: "it was removed; what took its place",
     413: "larger than allowed",
     422: "can't be used: what, where, remedy",
     429: "too many keys that aren't valid; `Retry-After` says when another is looked at",

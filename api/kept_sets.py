@@ -1,5 +1,5 @@
-"""What the service keeps as a recording set and hands out as one: sessions, recordings that were sent in, the cases of
-challenges. Handing out and deleting is one shape for all of them."""
+"""What the service keeps as a recording set and hands out as one: sessions, and recordings that were sent in. Handing
+out and deleting is one shape for both."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fastapi import Response
 
 from api.archives import sent
-from api.errors import Conflict, known
+from api.errors import Conflict
 from api.service import OVER, Service
 from lab.calibration.life import check_nothing_rests_on
 from lab.errors import InputError
@@ -72,21 +72,4 @@ def sent_set(service: Service, recordings_id: str) -> KeptSet:
         str(folder),
         lambda: inbox.recordings(recordings_id),
         lambda: inbox.remove(recordings_id),
-    )
-
-
-def challenge_folder(service: Service, challenge_id: str, case: str = "") -> KeptSet:
-    """Return a challenge, or with `case` one of its recording sets; 404 where there is none."""
-    kept = service.challenges
-    folder = known(
-        f"no challenge {challenge_id!r}; GET /api/v1/challenges lists them", lambda: kept.folder(challenge_id)
-    )
-    if case:
-        missing = f"challenge {challenge_id}: no case {case!r} is made; its `seals` list those that are"
-        known(missing, lambda: kept.case(challenge_id, case))
-    return KeptSet(
-        f"challenge {challenge_id} {case}".strip(),
-        str(folder),
-        lambda: kept.recordings(challenge_id, case),
-        lambda: kept.remove(challenge_id),
     )

@@ -15,6 +15,7 @@ import anyio
 
 from api.errors import Conflict
 from api.safety import KnownSafety, StationSafety, key_of
+from lab.calibration.life import check_certified
 from lab.capture.blocking_calls import in_thread
 from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.records import now
@@ -219,6 +220,7 @@ class LiveSessions:
                 on_progress=live.tell,
                 connect=self._connect,
                 asks_on_page=True,
+                check_certified=check_certified,
             )
             self._live[capture.id] = live
             live.begin(capture)
@@ -256,6 +258,7 @@ class LiveSessions:
                 on_progress=live.tell,
                 connect=self._connect,
                 asks_on_page=True,
+                check_certified=check_certified,
             )
             live.capture = capture  # from here on a halt reaches it
             self._live[session_id] = live

@@ -15,11 +15,6 @@ Nothing heavy is imported before a fixture is used: the plugin is loaded by ever
 
 from __future__ import annotations
 
-import contextlib
-import re
-import subprocess
-import sys
-import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,10 +26,6 @@ if TYPE_CHECKING:
     from api.client import ServiceClient
     from lab.capture.station import Station
     from lab.formats.results import FitResult
-
-#: How long (s) the service may take to start and to end.
-START_S, END_S = 120.0, 30.0
-_ADDRESS = re.compile(r"operator's page: (http://\S+)/")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -80,56 +71,12 @@ def calibench_station(calibench_bench: MockBench) -> Station:
     return read_station(calibench_bench.station_file)
 
 
-@contextlib.contextmanager
-def service_process(data: Path) -> Iterator[str]:
-    """`calibench serve` on a data folder, in a process of its own; its address."""
-    command = [sys.executable, "-m", "lab.cli", "serve", "--data", str(data), "--port", "0"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    assert process.stdout is not None
-    address: list[str] = []
-    said: list[str] = []
-    ready = threading.Event()
-
-    def listen() -> None:
-        assert process.stdout is not None
-        for line in process.stdout:
-            said.append(line)
-            if found := _ADDRESS.search(line):
-                address.append(found[1])
-            if "Uvicorn running" in line or "startup complete" in line:
-                ready.set()
-        ready.set()
-
-    listener = threading.Thread(target=listen, daemon=True)
-    listener.start()
-    try:
-        if not ready.wait(START_S) or not address or process.poll() is not None:
-            raise RuntimeError("calibench serve doesn't start: " + "".join(said[-20:]))
-        yield address[0]
-    finally:
-        process.terminate()
-        try:
-            process.wait(END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        listener.join(END_S)
-        process.stdout.close()
-
-
 @pytest.fixture(scope="session")
 def calibench_client(calibench_bench: MockBench, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceClient]:
     """A client of a service of its own, on an empty data folder, with the bench as the station `bench`."""
-    from api.client import ServiceClient
-    from api.keys import Permission, create_key
-    from lab.capture.store import Store
+    from api.local_service import local_service
 
-    data = tmp_path_factory.mktemp("calibench")
-    with contextlib.closing(Store(data)) as store:
-        key = create_key(store, "pytest", Permission.ADMIN)
-    (data / "stations").mkdir(exist_ok=True)
-    (data / "stations" / "bench.toml").symlink_to(calibench_bench.station_file)
-    with service_process(data) as url, ServiceClient(url, key) as client:
+    with local_service(calibench_bench.station_file, tmp_path_factory.mktemp("calibench"), name="bench") as client:
         yield client
 
 

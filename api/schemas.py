@@ -33,14 +33,13 @@ from lab.capture.records import RunRecord
 from lab.capture.session import Progress
 from lab.capture.station import Station
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
-from lab.challenge.kept import ChallengeWork
-from lab.challenge.truth import SIZES
 from lab.formats.importers import KINDS
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
 from lab.formats.results.diagnosis import DiagnosisVerdict
+from lab.jobs import RemovedKind
 from lab.pipeline import Step
 from lab.plain_text import complaints_of
-from sim.camera import Cfa, Side
+from sim.camera import Side
 
 #: Databases that forget the time zone give back UTC.
 Utc = Annotated[datetime, AfterValidator(lambda at: at if at.tzinfo else at.replace(tzinfo=UTC))]
@@ -633,7 +632,8 @@ class PipelineResults(Schema):
 
 
 class Job(Schema):
-    """A job on one source: a session, recordings that were sent in, or a challenge."""
+    """A job on one source: a session, or recordings that were sent in. Of kinds that were removed, neither is
+    stated."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -642,7 +642,6 @@ class Job(Schema):
                 "kind": "fit",
                 "session_id": "20300101-120000-abcdef",
                 "recordings_id": None,
-                "challenge_id": None,
                 "state": "running",
                 "progress": 0.4,
                 "message": "noise of the left camera",
@@ -655,10 +654,9 @@ class Job(Schema):
     )
 
     id: str
-    kind: JobKind | ChallengeWork
+    kind: JobKind | RemovedKind
     session_id: str | None
     recordings_id: str | None
-    challenge_id: str | None = None
     state: JobState
     steps: tuple[WorkStep, ...] = Field(default=(), description="of work on a session or on recordings, in order")
     progress: float = Field(ge=0, le=1)
@@ -733,44 +731,6 @@ class RecordingsDetail(Recordings):
     counts: tuple[CaptureCount, ...]
     verdict: DiagnosisVerdict | None = Field(default=None, description="of its newest diagnosis")
     results: dict[str, str] = Field(description="kind -> id of the newest `fit`, `validate`, `diagnose`, `report`")
-
-
-# --- challenges -------------------------------------------------------------------------------------------------------
-
-
-class ChallengeStart(Asked):
-    """A challenge to be made: recording sets of cameras that conceal something, their truths sealed until it is
-    scored."""
-
-    model_config = ConfigDict(
-        json_schema_extra={"example": {"cases": 20, "size": "small", "name": "since the upgrade"}}
-    )
-
-    cases: int = Field(ge=1, le=1000, description="how many recording sets")
-    size: Annotated[str, _one_of("size", SIZES), Field(json_schema_extra={"enum": list(SIZES)})] = Field(
-        default="medium", description="of the frames; foreign: frames, converters and screens of all sizes"
-    )
-    cfa: Cfa | None = Field(default=None, description="of all cases; null: as drawn")
-    name: str = Field(default="", max_length=120)
-
-
-class ChallengeJobStart(Asked):
-    """What to do with a challenge: `make` what is missing of it, or `score` it."""
-
-    kind: Literal["make", "score"]
-
-
-class Challenge(Schema):
-    """A challenge. Its truths, and the seed that they follow from, can't be read before it is scored."""
-
-    id: str
-    name: str
-    created: Utc
-    cases: int
-    size: str
-    cfa: Cfa | None
-    seals: dict[str, str] = Field(description="case -> SHA-256 of a salt and its truth, of the cases that are made")
-    scored: Utc | None = Field(description="when it was scored; null: its truths are sealed")
 
 
 # --- the twin

@@ -30,7 +30,6 @@ from lab.capture.records import RunRecord, SessionInfo
 from lab.capture.session import Progress
 from lab.capture.station import Station, read_station
 from lab.capture.store import Store
-from lab.challenge.kept import Challenges
 from lab.errors import InputError
 from lab.formats.results import ReportFile
 from lab.jobs import JobInfo, JobRunner
@@ -65,7 +64,6 @@ class Service:
     pictures: Pictures
     jobs: JobRunner
     inbox: Inbox
-    challenges: Challenges
     gate: Gate
     limits: Limits
     public: PublicText

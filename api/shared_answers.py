@@ -24,7 +24,7 @@ from api.security import Gate, TooManyFailures
 FRESH_S, LARGEST_BYTES, MOST = 0.5, 1 << 18, 256
 #: What is shared, below the API's prefix: what every key may read, and no stream.
 _SHARED = re.compile(
-    r"/(sessions|jobs|stations|queue|recordings|calibrations|camera-models|challenges|figures|history|drift)\b(?!.*/(events|archive|frame))"
+    r"/(sessions|jobs|stations|queue|recordings|calibrations|camera-models|figures|history|drift)\b(?!.*/(events|archive|frame))"
 )
 
 

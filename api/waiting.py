@@ -9,7 +9,8 @@ from concurrent.futures import Future
 
 from api.errors import Conflict
 from api.live import LiveSessions
-from lab.capture.queue import hold_queue, put_into_queue, queue
+from lab.capture.held_queue import hold_queue
+from lab.capture.queue import put_into_queue, queue
 from lab.capture.records import now
 from lab.capture.station import Station
 from lab.capture.store import Store

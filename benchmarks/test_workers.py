@@ -14,8 +14,8 @@ import pytest
 from distributed import LocalCluster
 
 from benchmarks.table import Row, show
-from lab.challenge.draw import kind_of
-from lab.challenge.make import make
+from evaluation.draw import kind_of
+from evaluation.make import make
 from lab.workers import Workers
 from sim.optics.traced_table import TableSettings, lens_table
 from sim.optics.zmx import read_zmx
@@ -41,7 +41,7 @@ def test_four_workers_beside_one(tmp_path: Path) -> None:
     rows = []
     for name, work, few, many in (
         ("lens table, 33 wavelengths, 32 field points", tables, 8, 32),
-        (f"{CASES} cases of a challenge", cases, 4, CASES),
+        (f"{CASES} cases of the blind proof", cases, 4, CASES),
     ):
         taken = [wall_s(count, work, few, many) for count in (1, WORKERS)]
         rows.append(Row(f"{name}: speed-up", taken[0] / taken[1], min(WORKERS, os.cpu_count() or 1), "", "ideal"))

@@ -3,10 +3,10 @@ left out.
 
     .venv/bin/python docs/draw_puzzle.py        (a minute)
 
-A camera of the second image former (`mocks.former`, which shares no code with the models that the diagnosis fits)
-conceals an optical low-pass filter of 1.6 um and an infrared-cut filter at 645 nm. Its recordings are diagnosed, and
-the curves of the result are drawn: the measured ones with bars of two standard deviations, the baseline's prediction
-dashed, the improved model's solid. Open points are captures that the diagnosis held out.
+A camera of the independent simulator (`evaluation.independent_simulator`, which shares no code with the models that the
+diagnosis fits) conceals an optical low-pass filter of 1.6 um and an infrared-cut filter at 645 nm. Its recordings are
+diagnosed, and the curves of the result are drawn: the measured ones with bars of two standard deviations, the
+baseline's prediction dashed, the improved model's solid. Open points are captures that the diagnosis held out.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
+from evaluation.independent_simulator.laws import InfraredCutFilterLaw, OpticalLowPassFilterLaw
 from lab.diagnose import diagnose
 from lab.effect_titles import effect_title
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult, ResidualCurve
-from mocks.former import ConcealedCamera, Plan
-from mocks.former.laws import InfraredCutFilterLaw, OpticalLowPassFilterLaw
 
 SEED, LOW_PASS_UM, BELOW_720_NM = 20751, 1.6, 75.0  # the filter's edge lies that far below 720 nm
 EDGE = "5 deg"

@@ -1,8 +1,8 @@
 """Records a session of the worked examples as a recording set: `python docs/record_examples.py OUT PART`, PART `bench`
 or `puzzle`.
 
-`bench`: a quick session of the mock bench that `calibench run --quick` starts. `puzzle`: a camera of the second image
-former with the same two filters concealed, of which `tests/lab/diagnose/test_example.py` makes the same recordings.
+`bench`: a quick session of the mock bench that `calibench run --quick` starts. `puzzle`: a camera of the independent
+simulator with the same two filters concealed, of which `tests/lab/diagnose/test_example.py` makes the same recordings.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
+from evaluation.independent_simulator.laws import InfraredCutFilterLaw, OpticalLowPassFilterLaw
 from lab.formats.recording_set import RecordingSet, write
-from mocks.former import ConcealedCamera, Plan
-from mocks.former.laws import InfraredCutFilterLaw, OpticalLowPassFilterLaw
 
 SEED, LOW_PASS_UM, BELOW_720_NM = 20751, 1.6, 60.0  # the filter's edge lies that far below 720 nm
 

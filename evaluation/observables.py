@@ -22,8 +22,8 @@ import numpy as np
 from scipy.special import chdtr
 from scipy.stats import kstest
 
+from evaluation.draw import draw
 from evaluation.own_chain import healthy_session
-from lab.challenge.draw import draw
 from lab.diagnose.inference.side_model import measurement_model
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet

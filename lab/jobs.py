@@ -1,5 +1,4 @@
-"""Long work as jobs: every goal of `lab.pipeline` and the work on challenges, in the background, with a row each in a
-table of the registry.
+"""Long work as jobs: every goal of `lab.pipeline`, in the background, with a row each in a table of the registry.
 
 The table holds state, progress and error; results are kept under the job's id. A job that needs no instrument runs on
 Dask: in this process by default, or on a cluster whose address the settings give. A job that captures runs in a thread
@@ -16,8 +15,7 @@ import time
 from dataclasses import replace
 from datetime import datetime
 from ipaddress import ip_address
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 from urllib.parse import urlsplit
 
 import sqlalchemy as sa
@@ -27,7 +25,6 @@ from lab.capture.file_lock import Lock
 from lab.capture.records import JobState, now
 from lab.capture.store import Store
 from lab.capture.tables import JobRow
-from lab.challenge.kept import WORK, ChallengeWork, carry_out
 from lab.errors import Cancelled, CannotWrite, DeviceError, InputError, NoRoom, NotDetermined, failure_of_environment
 from lab.pipeline import (
     STEPS,
@@ -48,8 +45,8 @@ if TYPE_CHECKING:
     from lab.resolve import ResolveLimits
     from sim.camera import Side
 
-JobKind = Goal | ChallengeWork
-KINDS = (*STEPS, *WORK)
+#: Kinds of earlier versions, of which registries may hold jobs.
+RemovedKind = Literal["make-challenge", "score-challenge"]
 
 #: The least time (s) between two rows of progress.
 _WRITE_EVERY_S = 0.2
@@ -61,7 +58,7 @@ class JobInfo(Frozen):
     model_config = ConfigDict(frozen=True, extra="ignore", from_attributes=True)
 
     id: str
-    kind: JobKind
+    kind: Goal | RemovedKind
     source: str
     state: JobState
     progress: float
@@ -76,6 +73,11 @@ class JobInfo(Frozen):
     def is_over(self) -> bool:
         """Whether the job has ended."""
         return self.state in ("done", "failed", "cancelled")
+
+
+def was_removed(kind: Goal | RemovedKind) -> bool:
+    """Return whether a job's kind is of an earlier version."""
+    return kind in get_args(RemovedKind)
 
 
 # --- the work ---------------------------------------------------------------------------------------------------------
@@ -127,16 +129,13 @@ def run_job(
                 row.state, row.finished = "cancelled", now()
                 return
             row.state, row.started = "running", now()
-            kind, source = cast(JobKind, row.kind), row.source
+            kind, source = cast(Goal, row.kind), row.source
         tell = _Reporter(store, job_id)
         try:
-            if kind in WORK:
-                carry_out(kind, Path(source), tell)
-            else:
-                request = _request(store, cast(Goal, kind), source, job_id, resolve, station)
-                if camera_model is not None:
-                    request = replace(request, models=_models(store, request, camera_model))
-                run_pipeline(request, tell.pipeline, store=store, capturer=capturer)
+            request = _request(store, kind, source, job_id, resolve, station)
+            if camera_model is not None:
+                request = replace(request, models=_models(store, request, camera_model))
+            run_pipeline(request, tell.pipeline, store=store, capturer=capturer)
         except Cancelled:
             _over(store, job_id, "cancelled", None)
         except (InputError, DeviceError, NotDetermined) as error:
@@ -297,7 +296,7 @@ class JobRunner:
 
     def submit(
         self,
-        kind: JobKind,
+        kind: Goal,
         source: str,
         *,
         resolve: ResolveLimits | None = None,
@@ -305,7 +304,7 @@ class JobRunner:
         camera_model: str | None = None,
         station: Station | None = None,
     ) -> str:
-        """Queue a job on a session's id, a recording set's folder, or a challenge's; returns the job's id.
+        """Queue a job on a session's id or a recording set's folder; returns the job's id.
 
         `capturer`: how the job reaches the instruments; with one, the job runs in a thread of this process. `resolve`:
         of a pipeline, take the captures that tell the remaining rivals apart, within these limits. `station`: the one
@@ -313,8 +312,8 @@ class JobRunner:
         that stands in for the fitted cameras of a validation or a diagnosis. Raises InputError for an unknown kind,
         and for `resolve` or `camera_model` where the job can't take it; NoRoom where the disk is full.
         """
-        if kind not in KINDS:
-            raise InputError(f"job {kind!r}: no such work; choose from {', '.join(KINDS)}")
+        if kind not in STEPS:
+            raise InputError(f"job {kind!r}: no such work; choose from {', '.join(STEPS)}")
         if resolve is not None and (kind != "pipeline" or capturer is None):
             raise InputError(f"job {kind}: only a pipeline on a session's station can resolve; leave resolve out")
         if camera_model is not None and kind not in ("validate", "diagnose"):

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 from lab.errors import Cancelled, InputError
+from lab.shown import Shown
 from sim.memory import return_freed_memory
 
 if TYPE_CHECKING:
@@ -175,8 +176,8 @@ Tell = Callable[[PipelineProgress], None]
 Capturer = Callable[[CaptureRequest, "Callable[[CaptureProgress], None]"], str]
 
 
-@dataclass(frozen=True)
-class PipelineResult:
+@dataclass(frozen=True, repr=False)  # an IPython prompt prefers a dataclass's own text
+class PipelineResult(Shown):
     """What a pipeline found; None for what its goal doesn't need."""
 
     recordings: RecordingSet
@@ -238,6 +239,7 @@ def capture_here(
 
     Raises what `CaptureSession.run` raises, and `Cancelled` if `tell` does: the session can then be resumed.
     """
+    from lab.calibration.life import check_certified
     from lab.capture.plan import full_plan
     from lab.capture.session import CaptureSession
     from lab.capture.station import drivers_of
@@ -256,7 +258,9 @@ def capture_here(
             threading.Thread(target=session.abort, args=("cancelled",), daemon=True).start()
 
     if request.session:
-        session = CaptureSession(store, request.session, station=station, on_progress=told, connect=drivers)
+        session = CaptureSession(
+            store, request.session, station=station, on_progress=told, connect=drivers, check_certified=check_certified
+        )
     else:
         session = CaptureSession.start(
             store,
@@ -267,6 +271,7 @@ def capture_here(
             demands_certified=request.demands_certified,
             on_progress=told,
             connect=drivers,
+            check_certified=check_certified,
         )
     session.run()
     if cancelled.is_set():

@@ -20,7 +20,6 @@ from lab.errors import InputError
 R = TypeVar("R")
 
 CONNECT_TIMEOUT_S = 10.0
-TICK_S = 1.0
 
 
 def dask_client(scheduler: str, timeout_s: float) -> Any:
@@ -47,14 +46,11 @@ def _cluster(scheduler: str) -> Iterator[Any]:
 
 @dataclass(frozen=True)
 class Workers:
-    """`jobs` processes of this computer, 1: this one unless it is to be `apart`; or with `scheduler` the workers of a
-    Dask cluster, however many those are. `tick` is called every second while processes of this computer work; what it
-    raises ends them at once."""
+    """`jobs` processes of this computer, 1: this one; or with `scheduler` the workers of a Dask cluster, however many
+    those are."""
 
     jobs: int = 1
     scheduler: str | None = None
-    apart: bool = False
-    tick: Callable[[], None] | None = None
 
     def done(self, work: Callable[..., R], items: Sequence[Any], *shared: Any) -> Iterator[tuple[int, R]]:
         """Number and result of `work(item, *shared)` of every item, as they get ready.
@@ -63,7 +59,7 @@ class Workers:
         where no scheduler answers."""
         if self.scheduler is not None and items:
             yield from self._on_cluster(self.scheduler, work, items, shared)
-        elif not items or (not self.apart and (self.jobs == 1 or len(items) < 2)):
+        elif self.jobs == 1 or len(items) < 2:
             for number, item in enumerate(items):
                 yield number, work(item, *shared)
         else:
@@ -86,11 +82,9 @@ class Workers:
             left = set(running)
             try:
                 while left:
-                    ready, left = wait(left, TICK_S, FIRST_COMPLETED)
+                    ready, left = wait(left, return_when=FIRST_COMPLETED)
                     for one in ready:
                         yield running[one], one.result()
-                    if self.tick is not None:
-                        self.tick()
             except BaseException:  # nobody waits for the rest
                 for process in list(pool._processes.values()):  # Python 3.14 has `kill_workers`
                     process.kill()

@@ -1,6 +1,6 @@
 """Compile what a new installation would compile at first use, into the packages' `__pycache__`.
 
-The modules, and the loops of drawing, fitting and tracing. It takes a quarter of a minute; a first session, and
+The modules, and the loops of drawing, fitting and tracing. It takes about half a minute; a first session, and
 processes that begin beside each other, find it done.
 """
 
@@ -13,7 +13,7 @@ import drivers
 import lab
 import mocks
 import sim
-from lab.challenge.draw import draw
+from lab.diagnose.reference_study import reference_study
 from lab.fit import fit_recording_set
 from mocks.bench import Bench
 from sim.optics.prescription import GlassName, Prescription, Surface
@@ -21,9 +21,9 @@ from sim.optics.system import OpticalSystem
 
 
 def compile_loops() -> None:
-    """Draw and fit a small set, and trace a lens of one surface."""
+    """Draw and fit the reference session, and trace a lens of one surface."""
     Bench(seed=1).compile_loops()
-    fit_recording_set(draw(1, 1, "small", cfa="MONO", kind="healthy", sizing="unmeasured").recordings)
+    fit_recording_set(reference_study())
     glass = GlassName(name="glass", model=True, index_d=1.5, abbe_d=60.0)
     front = Surface(curvature_per_mm=0.1, thickness_mm=30.0, glass=glass, semi_diameter_mm=2.0)
     lens = Prescription(

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import model_validator
 
-from sim.optics.illumination import CosineFourth, Illumination
+from sim.optics.fall_off import CosineFourth, Illumination
 from sim.optics.imaging import DiffractionLimited, Imaging, TracedLens
 from sim.parameters import Frozen, Quantity
 from sim.spectrum import Spectrum

@@ -428,7 +428,6 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
     charge, signal, codes = charge_of(camera, effects), signal_of(camera, effects), codes_of(camera, effects)
     particles = (law.during(exposure.exposure_s, camera.pixel_pitch_um) for law in charge.particles)
     disturbances = (*signal.random_at(exposure.elapsed_s), *particles)
-    excess = charge.excess_factor(exposure.gain_db)
 
     def draw_disturbances(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         return sum((one.draw(shape, rng) for one in disturbances), np.zeros((1, 1)))
@@ -448,7 +447,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         signal.filter_kernel(),
         signal.gain_map(shape),
         signal.read_kernel(),
-        excess,
+        charge.multiplication(exposure.gain_db),
         signal if signal.amplifiers else None,
     )
 

@@ -48,7 +48,7 @@ class Quantity:
     upper: float | None = None
     prior: tuple[float, float] | None = None
     absent: float | None = None
-    linear_power: int = 1
+    linear_power: float = 1
     logarithmic: bool = False
     dispensable: bool = False
     smooth_over: float = 0.0

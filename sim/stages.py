@@ -14,6 +14,7 @@ same axes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import reduce
@@ -29,7 +30,7 @@ from sim.optics.pupil import Wavefront, pupil_ratio
 from sim.sensor import mosaic
 from sim.sensor.amplifiers import CoupledAmplifiers
 from sim.sensor.defects import Defects, Jumps
-from sim.sensor.electrons import NEIGHBOURS
+from sim.sensor.electrons import NEIGHBOURS, NO_MULTIPLICATION, Multiplication
 from sim.sensor.lines import LineGains, LineNoise
 from sim.sensor.particles import Particles
 from sim.sensor.reading_order import OrderedNoise
@@ -357,8 +358,8 @@ class Charge(State):
     way to the output; in even light each finds nearly all that it loses. `particles`: charge of single particles.
     `variance_e2`: (mean electrons, shot noise's variance) -> variance. `correlation`: mean electrons (...) ->
     correlation (5, ...) of the shot noise with each neighbour, by the kinds of `sim.sensor.electrons.NEIGHBOURS`.
-    `excess`: gain setting in dB -> factor on the shot noise's variance by a random multiplication of each electron, 1
-    and more.
+    `excess`: gain setting in dB -> random multiplication of each electron, whose factor on the shot noise's variance is
+    1 and more.
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
@@ -377,7 +378,7 @@ class Charge(State):
     particles: tuple[Particles, ...] = ()
     variance_e2: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     correlation: tuple[Callable[[FloatArray], FloatArray], ...] = ()
-    excess: tuple[Callable[[float], float], ...] = ()
+    excess: tuple[Callable[[float], Multiplication], ...] = ()
 
     def collected_s(self, exposure_s: float) -> float:
         """Return the time in which light is collected, given the time that was asked for."""
@@ -478,9 +479,12 @@ class Charge(State):
             tile = law.steady_share * np.real(np.fft.ifft(np.fft.fft(tile, axis=law.axis) * shaped, axis=law.axis))
         return tile
 
-    def excess_factor(self, gain_db: float) -> float:
-        """Factor on the shot noise's variance at a gain setting."""
-        return reduce(lambda value, law: value * law(gain_db), self.excess, 1.0)
+    def multiplication(self, gain_db: float) -> Multiplication:
+        """Random multiplication of each electron at a gain setting; of several in turn the factors multiply."""
+        acting = [law(gain_db) for law in self.excess]
+        if len(acting) <= 1:
+            return acting[0] if acting else NO_MULTIPLICATION
+        return replace(acting[0], excess=math.prod(one.excess for one in acting))
 
     def hold_lag(self, electrons: FloatArray) -> FloatArray | float:
         """Return how many of a frame's electrons aren't read but stay for the next frame: image lag."""

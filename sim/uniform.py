@@ -354,17 +354,21 @@ class Uniform:
 
     def shot_e2(self, electrons: FloatArray, gain_db: float = 0.0) -> FloatArray:
         """Variance of the shot noise (e^2) at mean signals, at a gain setting."""
-        return self._charge.shot_e2(electrons) * self._charge.excess_factor(gain_db)
+        return self._charge.shot_e2(electrons) * self._charge.multiplication(gain_db).excess
 
     def excess_factor(self, gain_db: float = 0.0) -> float:
         """Return the factor on the shot noise's variance by which electrons are multiplied at random, at a gain
         setting."""
-        return self._charge.excess_factor(gain_db)
+        return self._charge.multiplication(gain_db).excess
+
+    def multiplied_skewness(self, gain_db: float = 0.0) -> float:
+        """Return E g^3 / (E g^2)^2 of the number g by which an electron is multiplied at a gain setting: 1 of none."""
+        return self._charge.multiplication(gain_db).skewness
 
     @property
-    def multiplies_electrons(self) -> bool:
-        """Return whether electrons are multiplied at random before read-out."""
-        return bool(self._charge.excess)
+    def changes_shot_noise(self) -> bool:
+        """Return whether the shot noise's variance isn't that of the electrons."""
+        return bool(self._charge.excess or self._charge.variance_e2)
 
     @property
     def particles(self) -> tuple[Particles, ...]:

@@ -11,10 +11,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-ROOMS = ("sim", "drivers", "mocks", "lab", "api", "tests", "docs", "benchmarks")
+ROOMS = ("sim", "drivers", "mocks", "lab", "api", "evaluation", "tests", "docs", "benchmarks")
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
 SOURCES = sorted(
-    [ROOT / "Makefile", *(p for room in ROOMS for p in (ROOT / room).rglob("*.py") if p != Path(__file__).resolve())]
+    [
+        ROOT / "Makefile",
+        *(p for room in (*ROOMS, "calibench") for p in (ROOT / room).rglob("*.py") if p != Path(__file__).resolve()),
+    ]
 )
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 CODE = re.compile(r"`([^`\n]+)`")
@@ -23,7 +26,7 @@ FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 WRITTEN = re.compile(r"(?:\b[Ww]rite\w* `|--out )([^`\s]+)")
 FILE = re.compile(rf"(?:{'|'.join(ROOMS)})/[\w*./-]*\w/?")
 PYTHON_FILE = re.compile(r"[\w/]+\.py")
-PYTHON_NAME = re.compile(rf"(?:{'|'.join(ROOMS[:5])})(?:\.[A-Za-z]\w*)+")
+PYTHON_NAME = re.compile(rf"(?:{'|'.join(ROOMS[:6])})(?:\.[A-Za-z]\w*)+")
 #: Folders that are made on use.
 MADE = ("calibench-data",)
 

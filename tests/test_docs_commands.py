@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -34,6 +35,7 @@ NOT_RUN = {
     "README.md": "CI runs make test; the first run is tests/lab/test_pipeline.py's",
     "docs/explanation/chain-of-light.md": "tests/lab/cli/test_cli.py simulates",
     "docs/explanation/diagnosis.md": "minutes; tests/lab/cli/test_cli.py saves a model and takes it as baseline",
+    "docs/explanation/evidence.md": "minutes; tests/lab/inference",
     "docs/explanation/examples/emva1288-ccd.md": "recordings of others; tests/test_real_recordings.py where they are",
     "docs/explanation/examples/flea3.md": "recordings of others; tests/test_real_recordings.py where they are",
     "docs/explanation/examples/low-pass-and-infrared-filter.md": "tests/lab/diagnose/test_example.py",
@@ -50,9 +52,10 @@ NOT_RUN = {
     "docs/how-to/soak-a-bench.md": "hours: make soak",
     "docs/how-to/use-a-cluster.md": "a cluster; tests/lab/test_workers.py starts one",
     "docs/how-to/use-my-recordings.md": "minutes; tests/lab/formats/importers/test_raw_folder.py",
+    "docs/how-to/write-an-extension.md": "installs a package; tests/lab/test_extensions.py",
     "docs/proof-twin.md": "hours: make twin",
-    "docs/proof-unlisted.md": "hours: make proof-unlisted; tests/lab/challenge/test_unlisted.py makes two cases",
-    "docs/proof.md": "hours: make proof; tests/lab/challenge/test_challenge.py makes and scores a few",
+    "docs/proof-unlisted.md": "hours: make proof-unlisted; tests/evaluation/test_unlisted.py makes two cases",
+    "docs/proof.md": "hours: make proof; tests/evaluation/test_sealed.py makes and scores a few",
     "docs/reference/command-line.md": "written by docs/write_tables.py from the command line itself",
     "docs/reference/instruments.md": "a bench; tests/lab/cli/test_devices.py and tests/mocks/test_command.py",
     "docs/tutorial.md": "minutes; tests/lab/test_pipeline.py",
@@ -85,7 +88,12 @@ def calibench_commands() -> list[tuple[str, str]]:
 
 def complaint(words: list[str]) -> str:
     """What the command line says of a command that it doesn't take; a file that isn't there is no fault of a page."""
-    command, context, name = command_tree(), None, "calibench"
+    return complaint_of(command_tree(), words)
+
+
+def complaint_of(command: Any, words: list[str]) -> str:
+    """What a command tree says of words that it doesn't take."""
+    context, name = None, "calibench"
     try:
         while True:
             context = command.make_context(name, list(words), parent=context)

@@ -9,6 +9,10 @@ export function stateCell(item) {
   return cell;
 }
 
+/** Whether a job works on a session or on recordings: one of a kind that was removed doesn't.
+ * @param {Model<"Job">} job */
+const hasSource = (job) => job.session_id !== null || job.recordings_id !== null;
+
 /** @type {Record<string, string[]>} */
 const REPORTS = { report: ["report"], pipeline: ["report", "result"] };
 
@@ -25,7 +29,7 @@ function row(job, problem, after, ...of) {
     cancel.addEventListener("click", told(problem, async () => (await post(`/jobs/${job.id}/cancel`), after())));
     actions.append(cancel);
   } else if (job.state === "done") {
-    for (const made of job.challenge_id ? [] : (REPORTS[job.kind] ?? ["result"])) {
+    for (const made of hasSource(job) ? (REPORTS[job.kind] ?? ["result"]) : []) {
       const href = `${api}/jobs/${job.id}/${made}`;
       actions.append(named("a", made === "report" ? "Report" : "JSON", what, { href, target: "_blank", rel: "noopener" }), " ");
     }
@@ -42,26 +46,23 @@ function row(job, problem, after, ...of) {
 }
 
 /** @param {Model<"Job">} job */
-const addressOf = (job) => {
-  if (job.challenge_id) return "#/challenges";
-  return job.session_id ? `#/sessions/${job.session_id}/jobs` : `#/recordings/${job.recordings_id}/jobs`;
-};
+const addressOf = (job) => (job.session_id ? `#/sessions/${job.session_id}/jobs` : `#/recordings/${job.recordings_id}/jobs`);
 
 // All jobs, each with what it works on.
 /** @type {Listing<"/jobs", Model<"Job">, Model<"Job"> & {of: string}>} */
 const all = new Listing(
   "jobs",
   "/jobs",
-  (job) => row(job, "job-problem", () => all.refresh(), element("td", {}, element("a", { href: addressOf(job), textContent: job.of }))),
+  (job) => row(job, "job-problem", () => all.refresh(), element("td", {}, hasSource(job) ? element("a", { href: addressOf(job), textContent: job.of }) : job.of)),
   (jobs) => jobs.map((job) => ({ ...job, of: nameOf(job) })),
 );
 
-/** Names of challenges and sessions, by id.
+/** Names of sessions, by id.
  * @type {Map<string, string>} */
 let names = new Map();
 /** @param {Model<"Job">} job */
 const nameOf = (job) => {
-  if (job.challenge_id) return names.get(job.challenge_id) ?? "a challenge";
+  if (!hasSource(job)) return "a challenge, a kind of work that was removed";
   return job.session_id ? (names.get(job.session_id) ?? job.session_id) : `recordings ${job.recordings_id}`;
 };
 
@@ -70,8 +71,8 @@ addView({
   section: "view-jobs",
   title: () => "Jobs",
   async show() {
-    const [sessions, challenges] = await Promise.all([ask("/sessions?limit=50"), ask("/challenges?limit=50")]);
-    names = new Map([...sessions, ...challenges].map((one) => [one.id, one.name || one.id]));
+    const sessions = await ask("/sessions?limit=50");
+    names = new Map(sessions.map((session) => [session.id, session.name || session.id]));
     await all.refresh();
   },
 });

@@ -1,7 +1,6 @@
 // The operator's page: the log-in, the desk where sessions are started, and the round that asks what is new. No framework: functions over fetch.
 
 import "./calibrations.js";
-import "./challenges.js";
 import "./drift.js";
 import "./inspector.js";
 import "./models.js";

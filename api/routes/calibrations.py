@@ -8,7 +8,6 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
-from api.certificate import Certificate, certificate, certificate_page, rejections
 from api.errors import Conflict, answers, known
 from api.keys import Permission, StoredKey
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
@@ -22,6 +21,7 @@ from lab.capture.store import Store
 from lab.errors import InputError
 from lab.formats.results import FitResult
 from lab.formats.results.words import plain_name, unit_of
+from lab.report.certificate import Certificate, certificate, certificate_page, rejections
 
 router = APIRouter(tags=["calibrations"])
 

@@ -16,9 +16,8 @@ from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart, WorkStep
 from api.security import REPORT_POLICY, Demand
 from api.service import ADMIN, CALIBRATE, HEX_ID, READ, SESSION_ID, Here, HexId, Service, SessionId, camera_model
-from lab.challenge.kept import WORK
 from lab.formats.results import DiagnosisResult, FitResult, ReportFile, ValidationResult
-from lab.jobs import JobInfo
+from lab.jobs import JobInfo, was_removed
 from lab.pipeline import STEPS, Goal, source_recordings
 from lab.resolve import resolve_limits, station_of
 
@@ -40,15 +39,13 @@ def steps_of(info: JobInfo, *, captures: bool) -> tuple[WorkStep, ...]:
 
 def _job(service: Service, info: JobInfo) -> Job:
     recordings_id = service.inbox.id_of(info.source)
-    challenge_id = service.challenges.id_of(info.source)
     return Job(
         **info.model_dump(exclude={"source", "message", "error", "cancel_requested"}),
         steps=steps_of(info, captures=recordings_id is None),
         message=service.public(info.message),
         error=service.public.or_none(info.error),
-        session_id=info.source if recordings_id is None and challenge_id is None else None,
+        session_id=info.source if recordings_id is None and not was_removed(info.kind) else None,
         recordings_id=recordings_id,
-        challenge_id=challenge_id,
     )
 
 
@@ -240,8 +237,8 @@ def job_result(service: Here, job_id: HexId) -> Response:
     kind = _done(service, job_id).kind
     if kind == "report":
         raise HTTPException(404, f"job {job_id} made a report; GET /api/v1/jobs/{job_id}/report")
-    if kind in WORK:
-        raise HTTPException(404, f"job {job_id} worked on a challenge; GET /api/v1/challenges/ID has it")
+    if was_removed(kind):
+        raise HTTPException(404, f"job {job_id}: its kind, {kind}, was removed; its result isn't in the registry")
     # As it was stored: no second serialisation that could differ.
     document = service.store.result(job_id).document
     if kind == "pipeline":

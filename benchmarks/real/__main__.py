@@ -14,7 +14,7 @@ from benchmarks.real.kept import Kept, kept_in
 from benchmarks.real.page import page_of, write_examples
 from benchmarks.real.sets import DeclaredSet, declared_sets, sets_in
 from benchmarks.real.take_through import DIAGNOSIS, FIT, ROOT, run_set
-from lab.challenge.truth import load, store
+from evaluation.truth import load, store
 from lab.errors import InputError
 from lab.formats.results import DiagnosisResult, FitResult
 

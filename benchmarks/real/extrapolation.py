@@ -12,10 +12,10 @@ from typing import Annotated
 
 import typer
 
+from evaluation.page import placed
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
-from lab.challenge.proof import placed
 from lab.diagnose import examine
 from lab.errors import InputError
 from lab.fit import fit_recording_set

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from benchmarks.real.judge import SetResult
-from lab.challenge.truth import load
+from evaluation.truth import load
 from sim.parameters import Frozen
 
 

@@ -10,7 +10,7 @@ from benchmarks.real.compare import PULL
 from benchmarks.real.judge import EXPLAINED, QUANTILE, JudgedFigure, SetResult
 from benchmarks.real.kept import Kept
 from benchmarks.real.sets import DeclaredSet
-from lab.challenge.proof import placed
+from evaluation.page import placed
 from lab.observables.observable import measurement_title
 
 HEAD = """# Real recordings

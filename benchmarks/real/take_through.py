@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.real.sets import TABLE, DeclaredSet
-from lab.challenge.truth import load, store
+from evaluation.truth import load, store
 from lab.errors import InputError
 from lab.formats.results import DiagnosisResult, FitResult
 from sim.parameters import Frozen

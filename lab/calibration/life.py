@@ -39,6 +39,7 @@ from lab.fit.noise.dark_current import SensorTemperature
 from lab.formats.recording_set import InstrumentSnapshot, Snapshots, differences
 from lab.formats.results import FitResult
 from lab.formats.results.words import plain_name
+from lab.shown import Tabular
 from sim.camera import Side
 from sim.parameters import Frozen
 
@@ -85,7 +86,7 @@ class HistoryPoint(Frozen):
     drifted: bool
 
 
-class History(Frozen):
+class History(Tabular, Frozen):
     """A figure of a camera over its calibrations, oldest first, one entry each. `title`, `unit`: as a lab reads them.
     `threshold_sigma`: beyond it a change is called a drift."""
 

@@ -2,21 +2,40 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import sqlalchemy as sa
-from alembic import command
-from alembic.config import Config
-from alembic.runtime.migration import MigrationContext
-from alembic.script import ScriptDirectory
 
 from lab.capture.file_lock import Lock
-from lab.capture.tables import VERSIONS
+from lab.capture.tables import SWAPPING
 from lab.errors import InputError
 
+#: The registry's migrations; a revision's name begins the name of its file.
+VERSIONS = Path(__file__).parent / "migrations" / "versions"
 
-def migrate(engine: sa.Engine, folder: Path) -> None:
-    """Bring the registry of the data folder to the newest revision. Raises InputError where it isn't a registry."""
+
+def upgrade(engine: sa.Engine, folder: Path) -> None:
+    """Bring the registry of the data folder to the newest revision. Raises InputError where it isn't a registry, and
+    where a restored one is only half in its place."""
+    if (folder / SWAPPING).exists():
+        raise InputError(
+            f"{folder}: a restore ended while it put files in place; call the same `calibench restore` again"
+        )
+    newest = max(file.name.partition("_")[0] for file in VERSIONS.glob("[0-9]*.py"))
+    with contextlib.suppress(sa.exc.SQLAlchemyError), engine.connect() as connection:
+        if connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalars().all() == [newest]:
+            return
+    _migrate(engine, folder)
+
+
+def _migrate(engine: sa.Engine, folder: Path) -> None:
+    """Bring a registry that isn't of the newest revision to that."""
+    from alembic import command  # here, as it takes a tenth of a second to load
+    from alembic.config import Config
+    from alembic.runtime.migration import MigrationContext
+    from alembic.script import ScriptDirectory
+
     config = Config()
     config.set_main_option("script_location", str(VERSIONS.parent))
     scripts = ScriptDirectory.from_config(config)

@@ -11,23 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any
 
-import sqlalchemy as sa
-from sqlalchemy.orm import Session
-
-from lab.capture.station import Station
+from lab.capture.held_queue import HELD, waiting_rows
+from lab.capture.store import Store
 from lab.capture.tables import SessionRow
 from lab.errors import InputError
 from sim.parameters import Frozen
 
-if TYPE_CHECKING:
-    from lab.capture.store import Store
-
 #: States from which a session may be queued.
 STARTABLE = ("created", "interrupted", "failed", "queued")
-#: Prefix of the reason of a hold in the registry.
-HELD = "held: "
 
 
 class QueuedSession(Frozen):
@@ -53,7 +45,7 @@ def queue(store: Store) -> list[QueuedSession]:
                 not_before=_aware(row.not_before),
                 held=row.error.removeprefix(HELD) if row.error else None,
             )
-            for place, row in enumerate(_waiting(db), start=1)
+            for place, row in enumerate(waiting_rows(db), start=1)
         ]
 
 
@@ -69,7 +61,7 @@ def put_into_queue(
         if row is None or row.state not in STARTABLE:
             state = "unknown" if row is None else row.state
             raise InputError(f"session {session_id} is {state}; only one that can be started or resumed can wait")
-        others = [other for other in _waiting(db) if other.id != session_id]
+        others = [other for other in waiting_rows(db) if other.id != session_id]
         now_at = row.queue_place if row.queue_place is not None else len(others)
         others.insert(min(place - 1 if place is not None else now_at, len(others)), row)
         row.state, row.not_before, row.error = "queued", not_before, f"{HELD}{held}" if held else None
@@ -121,27 +113,6 @@ def leave_queue(store: Store, session_id: str) -> None:
         done = bool(row.runs)
         row.state, row.error = ("interrupted", "taken out of the queue") if done else ("created", None)
         row.queue_place = row.not_before = None
-
-
-def hold_queue(db: Session, why: str, station: dict[str, Any] | None = None) -> None:
-    """Hold the queued sessions that need an instrument of `station` (as the registry has it); None: all queued
-    sessions."""
-    addresses = None if station is None else Station.model_validate(station).addresses
-    for row in _waiting(db):
-        if addresses is None or addresses & Station.model_validate(row.station).addresses:
-            row.error = f"{HELD}{why}"
-
-
-def release_held_by(db: Session, session_id: str) -> None:
-    """Release the sessions that this one held, once it has finished."""
-    for row in _waiting(db):
-        if row.error is not None and row.error.startswith(f"{HELD}session {session_id} "):
-            row.error = None
-
-
-def _waiting(db: Session) -> list[SessionRow]:
-    asked = sa.select(SessionRow).where(SessionRow.queue_place.is_not(None))
-    return list(db.scalars(asked.order_by(SessionRow.queue_place, SessionRow.created)))
 
 
 def _aware(at: datetime | None) -> datetime | None:

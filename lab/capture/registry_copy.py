@@ -11,7 +11,8 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from lab.capture.tables import Base, open_engine, upgrade
+from lab.capture.migrate import upgrade
+from lab.capture.tables import Base, open_engine
 from lab.errors import InputError
 
 #: Rows that are copied at a time.

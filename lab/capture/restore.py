@@ -26,12 +26,13 @@ from lab.capture.generations import (
     sync_folder,
     sync_folders,
 )
+from lab.capture.migrate import VERSIONS
 from lab.capture.records import now
 from lab.capture.registry_copy import copy_registry, count_sessions, load_registry
 from lab.capture.session_files import PACK
 from lab.capture.settings import Settings
 from lab.capture.store import Store
-from lab.capture.tables import STAGED, SWAPPING, VERSIONS
+from lab.capture.tables import STAGED, SWAPPING
 from lab.errors import InputError
 
 #: What stays where it is when a data folder makes room for a restored one.

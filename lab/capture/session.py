@@ -46,6 +46,8 @@ from lab.formats.recording_set import Snapshots, differences
 from sim.parameters import Frozen
 
 T = TypeVar("T")
+#: Raises InputError unless the rig of these instruments has a certified calibration.
+CheckCertified = Callable[[Store, Snapshots, Station], None]
 log = logging.getLogger(__name__)
 # Without a handler, bluesky's errors would go to stderr as tracebacks, across the progress bar.
 logging.getLogger("bluesky").addHandler(logging.NullHandler())
@@ -63,6 +65,14 @@ MOST_TRIES = 3
 #: In the error of a session whose run left an instrument out of its safe state.
 UNSAFE = "not brought into a safe state"
 PACKAGES = ("calibench", "numpy", "bluesky", "pyserial", "pyusb", "h5py")
+
+
+def _refuse(store: Store, instruments: Snapshots, station: Station) -> None:
+    """Refuse a session that demands a certified calibration where its program doesn't look for one."""
+    raise InputError(
+        f"station {station.name}: the session demands a certified calibration, and nothing here checks it; run it by "
+        "`calibench capture` or the service"
+    )
 
 
 class Progress(Frozen):
@@ -150,7 +160,8 @@ class CaptureSession:
 
     `station`: None for the station of its last run, or that it was registered with; another one where instruments have
     new addresses. `on_progress` is called from a thread of the run. An exception that it raises ends the run.
-    `asks_on_page`: a person as stage is asked by `lab.capture.questions`, not on the terminal."""
+    `asks_on_page`: a person as stage is asked by `lab.capture.questions`, not on the terminal. `check_certified`: a
+    session that demands a certified calibration needs it."""
 
     def __init__(
         self,
@@ -161,12 +172,14 @@ class CaptureSession:
         on_progress: Callable[[Progress], None] | None = None,
         connect: Callable[[Station], Drivers] = drivers_of,
         asks_on_page: bool = False,
+        check_certified: CheckCertified | None = None,
     ) -> None:
         self.store, self.id = store, session_id
         self.station = station or store.station(session_id)
         self._on_progress = on_progress
         self._connect = connect
         self._asks_on_page = asks_on_page
+        self._check_certified = check_certified or _refuse
         self._told: Progress | None = None
         self._asks: Question | None = None
         self._engine: RunEngine | None = None
@@ -200,6 +213,7 @@ class CaptureSession:
         on_progress: Callable[[Progress], None] | None = None,
         connect: Callable[[Station], Drivers] = drivers_of,
         asks_on_page: bool = False,
+        check_certified: CheckCertified | None = None,
     ) -> CaptureSession:
         """Register a new session, by default of everything that the station can do. `run` starts it.
 
@@ -218,7 +232,10 @@ class CaptureSession:
             notes=notes,
             demands_certified=demands_certified,
         )
-        return cls(store, session_id, on_progress=on_progress, connect=connect, asks_on_page=asks_on_page)
+        return cls(
+            store, session_id, on_progress=on_progress, connect=connect, asks_on_page=asks_on_page,
+            check_certified=check_certified,
+        )  # fmt: skip
 
     # --- from other threads -------------------------------------------------------------------------------------------
 
@@ -436,9 +453,7 @@ class CaptureSession:
             found = instruments.connect(self._check_goes_on)
             self._check_identities(found)
             if self.store.session(self.id).demands_certified:
-                from lab.calibration.life import check_certified
-
-                check_certified(self.store, found, self.station)
+                self._check_certified(self.store, found, self.station)
             instruments.check([entry.step for entry in self._entries if entry.finished is None])
             self.store.set_state(self.id, "running", run=self._provenance(found), station=self.station)
             self._drive(instruments)

@@ -35,8 +35,9 @@ from sqlalchemy.orm import Session, defer, sessionmaker
 from drivers.found_settings import FoundSettings
 from lab.capture.durable_files import npy_bytes, write_durably
 from lab.capture.file_lock import Lock
+from lab.capture.held_queue import hold_queue, release_held_by
+from lab.capture.migrate import upgrade
 from lab.capture.nexus import write_nexus
-from lab.capture.queue import hold_queue, release_held_by
 from lab.capture.records import (
     CaptureInfo,
     JournalEntry,
@@ -62,7 +63,6 @@ from lab.capture.tables import (
     SessionRow,
     StepRow,
     open_engine,
-    upgrade,
 )
 from lab.capture_kinds.base import CAPTURES, Capture, Step
 from lab.errors import CannotWrite, InputError, NoRoom, cannot_write

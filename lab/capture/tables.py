@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -269,27 +268,7 @@ def open_engine(url: str) -> sa.Engine:
     return engine
 
 
-#: The registry's migrations; a revision's name begins the name of its file.
-VERSIONS = Path(__file__).parent / "migrations" / "versions"
-
-
 #: Where a generation of a backup is staged in a data folder, and the mark that its entries are being put in place
 #: (see `lab.capture.restore`).
 STAGED = Path(".restore")
 SWAPPING = STAGED / "complete"
-
-
-def upgrade(engine: sa.Engine, folder: Path) -> None:
-    """Bring the registry of the data folder to the newest revision. Raises InputError where it isn't a registry, and
-    where a restored one is only half in its place."""
-    if (folder / SWAPPING).exists():
-        raise InputError(
-            f"{folder}: a restore ended while it put files in place; call the same `calibench restore` again"
-        )
-    newest = max(file.name.partition("_")[0] for file in VERSIONS.glob("[0-9]*.py"))
-    with contextlib.suppress(sa.exc.SQLAlchemyError), engine.connect() as connection:
-        if connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalars().all() == [newest]:
-            return
-    from lab.capture.migrate import migrate  # here, as what it needs takes a tenth of a second to load
-
-    migrate(engine, folder)

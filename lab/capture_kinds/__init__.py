@@ -1,12 +1,13 @@
 """The kinds of capture: one file each, with all that the rest of `lab` and `api` needs of the kind.
 
-The list below is the only one. A new kind is a file here and a line in that list: see
-`docs/how-to/add-a-capture-kind.md`.
+A new kind is a file here and a line in the list below (`docs/how-to/add-a-capture-kind.md`), or an entry point of the
+group `calibench.capture_kinds` in another package.
 """
 
 from importlib import import_module
 
 from lab.capture_kinds.base import register
+from sim.extensions import extensions, refuse
 
 #: The files, in the order in which a full session takes the kinds.
 FILES = (
@@ -24,3 +25,8 @@ FILES = (
 )
 for _file in FILES:
     register(import_module(f"{__name__}.{_file}").KIND)
+for _name, _kind in extensions("capture_kinds"):  # of other packages
+    try:
+        register(_kind)
+    except Exception as error:  # whatever it is that isn't a kind of capture
+        refuse("capture_kinds", _name, f"{_kind!r} can't be registered ({type(error).__name__}: {error})")

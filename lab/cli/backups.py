@@ -9,9 +9,10 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from lab.capture.data_folder import store_to_read
 from lab.capture.generations import KEPT, acting_as_owner
 from lab.cli.console import EXIT_CHECK, err, out, progress_bar, warn
-from lab.cli.sources import StoreFolder, store_to_read
+from lab.cli.sources import StoreFolder
 from lab.errors import InputError
 
 commands = typer.Typer()

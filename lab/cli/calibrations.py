@@ -10,8 +10,9 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from lab.capture.data_folder import store_to_read
 from lab.cli.console import EXIT_CHECK, check_writable, out, warn, write_json
-from lab.cli.sources import Json, StoreFolder, store_to_read
+from lab.cli.sources import Json, StoreFolder
 from lab.errors import InputError
 
 if TYPE_CHECKING:

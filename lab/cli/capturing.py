@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
+from lab.capture.data_folder import open_store, store_to_read
 from lab.cli.bench_process import mock_bench
 from lab.cli.console import check_writable, err, out, write_json
-from lab.cli.sources import Json, StoreFolder, open_store, recordings_of, run_here, store_to_read
+from lab.cli.sources import Json, StoreFolder, recordings_of, run_here
 from lab.cli.tables import print_fit, print_resolving, print_sequences
 from lab.errors import InputError
 from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult, capture_here

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from lab.capture.data_folder import existing_store
 from lab.cli.console import EXIT_CHECK, EXIT_INPUT, check_output, check_writable, err, make_folder, out, write_json
 from lab.cli.sources import (
     FitFile,
@@ -17,7 +18,6 @@ from lab.cli.sources import (
     Source,
     StoreFolder,
     camera_path,
-    existing_store,
     read_given,
     read_models,
     recordings_of,

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 from typer.core import TyperGroup
 
-from lab.cli.console import check_writable, out, write_json
+from lab.cli.console import EXIT_CHECK, check_folder, check_writable, make_folder, out, warn, write_json
 from lab.cli.sources import Json, StoreFolder, recordings_of, run_here
 from lab.errors import InputError
 from lab.pipeline import PipelineRequest
@@ -35,6 +35,8 @@ commands = typer.Typer(
     help="The library of effects, and drafts of new ones from discovered laws. `calibench effects NAME` is "
     "`calibench effects list NAME`.",
 )
+#: `calibench check-effect`, which stands beside `calibench effects`.
+check_command = typer.Typer()
 
 
 @commands.command("list")
@@ -48,11 +50,13 @@ def list_effects(
     Example: calibench effects list optical_low_pass_filter
     """
     from lab.diagnose.visibility import EffectList, effect_description, effect_list
+    from sim.extensions import refused
 
     check_writable(json)
     told = EffectList(effects=(effect_description(name),)) if name else effect_list()
     write_json(told, json)
     if str(json) != "-":
+        warn(refused())
         for family in told.families:
             out.print(f"[bold]{escape(family.name)}[/]: {escape(family.sentence)} {escape(', '.join(family.members))}")
         if told.families:
@@ -71,23 +75,33 @@ def draft(
     ],
     law: Annotated[int, typer.Option("--law", metavar="N", help="which of the discovered laws, from 1 on")],
     out_file: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="the effect's file; its name is the effect's")
+        Path,
+        typer.Option(
+            "--out",
+            metavar="FILE or DIR",
+            help="the effect's file, NAME.py, for a checkout; or the folder of an installable package, NAME",
+        ),
     ],
     data: StoreFolder = None,
 ) -> None:
-    """Write a law that a diagnosis discovered as a new effect's file, with its test. Both pass the contract of effects
-    as they stand; existing files are kept.
+    """Write a law that a diagnosis discovered as a new effect's file with its test, or as a package that `pip install`
+    takes. They pass the contract of effects as they stand; existing files are kept.
 
-    Example: calibench effects draft diagnosis.json --law 1 --out code_step.py
+    Example: calibench effects draft diagnosis.json --law 1 --out code_step
     """
     from lab.diagnose.effect_draft import draft as drafted
     from lab.diagnose.effect_draft import place_of_test
+    from lab.effect_packages import drafted_package, package_files
     from lab.formats.result_file import read_result
     from lab.formats.results import DiagnosisResult
 
-    files = out_file, place_of_test(out_file)
+    is_package = out_file.suffix != ".py"
+    files = package_files(out_file) if is_package else (out_file, place_of_test(out_file))
+    if is_package:
+        check_folder(out_file)
     for file in files:
-        check_writable(file)
+        if not is_package:
+            check_writable(file)
         if file.exists():
             raise InputError(f"{file}: is there already; name another file, or remove it")
     if source.endswith(".json"):
@@ -100,10 +114,35 @@ def draft(
     if not 1 <= law <= len(laws):
         there = f"laws 1 to {len(laws)} were discovered" if laws else "no law was discovered"
         raise InputError(f"--law {law}: {there} in {source}; `calibench diagnose` tells them in their order")
-    for file, text in zip(files, drafted(laws[law - 1], law, diagnosis.source, out_file), strict=True):
+    write = drafted_package if is_package else drafted
+    texts = write(laws[law - 1], law, diagnosis.source, out_file)
+    if is_package:
+        make_folder(out_file)
+    for file, text in zip(files, texts, strict=True):
         file.write_text(text, encoding="utf-8")
         out.print(f"{file}")
     out.print(escape(laws[law - 1].statement))
+
+
+@check_command.command("check-effect")
+def check_effect(
+    package: Annotated[
+        str, typer.Argument(metavar="PACKAGE", help="an installed package, or the name of an effect that one adds")
+    ],
+) -> None:
+    """Run the contract of effects on those of an installed package. Exit code 4 where one doesn't keep it.
+
+    Example: calibench check-effect calibench-effect-code-step
+    """
+    from lab.effect_packages import check_package
+
+    found = check_package(package)
+    for name, lines in found.items():
+        for line in lines:
+            out.print(escape(f"{name}: {line}"))
+        out.print(escape(f"{name}: {f'{len(lines)} complaints' if lines else 'keeps the contract of effects'}"))
+    if any(found.values()):
+        raise typer.Exit(EXIT_CHECK)
 
 
 def _print_effect(effect: EffectDescription) -> None:

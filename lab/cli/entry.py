@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from typing import Annotated, Any
 
@@ -15,7 +16,6 @@ import typer
 from rich.markup import escape
 
 from lab.cli import backups, calibrations, capturing, devices, diagnosis, effects, fitting, recordings, simulation
-from lab.cli.challenge import commands as challenge
 from lab.cli.console import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, Terminated, err, out
 from lab.cli.help import complete_help
 from lab.cli.twin import commands as twin
@@ -33,11 +33,15 @@ app = typer.Typer(
 for _group in (capturing, fitting, diagnosis, recordings, backups, simulation):
     app.registered_commands += _group.commands.registered_commands
 app.add_typer(effects.commands)
-app.add_typer(challenge)
+app.add_typer(effects.check_command)
 app.add_typer(twin)
 app.add_typer(calibrations.calibrations)
 app.add_typer(devices.devices)
 app.add_typer(devices.station)
+
+
+#: Commands that were removed, and what took their place.
+REMOVED = {"challenge": "in a checkout of the project, run `python -m evaluation`"}
 
 
 def _tell_version(asked: bool) -> None:
@@ -94,15 +98,30 @@ def _ended_as_by_ctrl_c() -> Iterator[None]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
+    words = sys.argv[1:] if arguments is None else arguments
+    if words and words[0] in REMOVED:
+        err.print(f"[red]calibench:[/] {words[0]}: this command was removed; {REMOVED[words[0]]}")
+        return EXIT_INPUT
+    return run_command_line(command_tree, "calibench", arguments)
+
+
+def run_command_line(commands: Callable[[], Any], program: str, arguments: list[str] | None) -> int:
+    """Run a command line; return its exit code, errors among them, each reported in one line.
+
+    Args:
+        commands: returns the click command; an interruption while it loads counts, too.
+        program: as it is called; its last word begins the lines of errors.
+        arguments: None: those of this process.
+    """
+    speaker = program.rsplit(maxsplit=1)[-1]
     try:
-        commands = command_tree()
         with _ended_as_by_ctrl_c():
-            code = commands.main(arguments, prog_name="calibench", standalone_mode=False)
+            code = commands().main(arguments, prog_name=program, standalone_mode=False)
     except (InputError, DeviceError, CannotWrite) as error:
         if os.environ.get("CALIBENCH_DEBUG"):
             traceback.print_exc()
         for line in str(error).splitlines():
-            err.print(f"[red]calibench:[/] {escape(line)}")
+            err.print(f"[red]{speaker}:[/] {escape(line)}")
         return error.exit_code
     except KeyboardInterrupt:
         code = EXIT_INTERRUPTED
@@ -110,21 +129,21 @@ def main(arguments: list[str] | None = None) -> int:
         usage = getattr(error, "format_message", None)
         if usage is not None:
             context = getattr(error, "ctx", None)
-            command = context.command_path if context is not None else "calibench"
+            command = context.command_path if context is not None else program
             text = usage() if usage().endswith((".", "?")) else f"{usage()}."
-            err.print(f"[red]calibench:[/] {escape(text)} See `{command} --help`.")
+            err.print(f"[red]{speaker}:[/] {escape(text)} See `{command} --help`.")
             return EXIT_INPUT
         if os.environ.get("CALIBENCH_DEBUG"):
             traceback.print_exc()
         if (told := failure_of_environment(error)) is not None:
-            err.print(f"[red]calibench:[/] {escape(str(told))}")
+            err.print(f"[red]{speaker}:[/] {escape(str(told))}")
             return EXIT_INPUT
         text = " ".join(str(error).split())
         err.print(
-            f"[red]calibench:[/] {type(error).__name__}: {escape(text)}: a defect of calibench; "
+            f"[red]{speaker}:[/] {type(error).__name__}: {escape(text)}: a defect of calibench; "
             "report it with what CALIBENCH_DEBUG=1 shows"
         )
         return EXIT_INTERNAL
     if code == EXIT_INTERRUPTED:
-        err.print("[red]calibench:[/] interrupted")
+        err.print(f"[red]{speaker}:[/] interrupted")
     return int(code or 0)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
+from lab.capture.data_folder import store_to_read
 from lab.cli.console import out, progress_bar, warn
-from lab.cli.sources import recordings_of, store_to_read
+from lab.cli.sources import recordings_of
 from lab.errors import InputError
 from lab.pipeline import session_recordings
 
@@ -43,7 +45,9 @@ def import_spectra(path: Path, to: Path) -> None:
     warn(tuple(f"{path}: {remark}" for remark in found.remarks))
     files = {to if to.suffix.lower() == ".csv" else to / "1.csv": one for one in found.spectra.values()}
     if len(found.spectra) > 1:
-        names = {name: "".join(c if c.isalnum() or c in "-_." else "_" for c in name) for name in found.spectra}
+        names = {
+            name: re.sub(r"^\.+|[^\w.-]", lambda match: "_" * len(match[0]), name) for name in found.spectra
+        }  # no hidden file, whatever a sample's name begins with
         if len(set(names.values())) < len(names) or to.suffix.lower() == ".csv":
             raise InputError(f"{to}: {path} holds {len(names)} spectra; give a folder by --out, and other names")
         files = {to / f"{names[name]}.csv": one for name, one in found.spectra.items()}

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
+from lab.capture.data_folder import existing_store
 from lab.cli.console import EXIT_CHECK, check_folder, check_writable, err, make_folder, warn, write_json
-from lab.cli.sources import Json, Source, StoreFolder, existing_store, recordings_of, run_here
+from lab.cli.sources import Json, Source, StoreFolder, recordings_of, run_here
 from lab.cli.tables import print_comparison, print_fit
 from lab.errors import NotDetermined
 from lab.pipeline import PipelineRequest

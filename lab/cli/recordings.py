@@ -10,6 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from lab.capture.data_folder import store_to_read
 from lab.cli.console import check_output, check_writable, out, progress_bar, warn, write_json
 from lab.cli.exchange import (
     LENSFUN,
@@ -24,7 +25,7 @@ from lab.cli.exchange import (
     import_spectra,
     import_tiled,
 )
-from lab.cli.sources import StoreFolder, recordings_of, store_to_read
+from lab.cli.sources import StoreFolder, recordings_of
 from lab.cli.tables import print_fit
 from lab.errors import InputError
 from lab.pipeline import session_recordings

@@ -9,8 +9,9 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from lab.capture.data_folder import existing_store
 from lab.cli.console import check_writable, out, write_json
-from lab.cli.sources import Json, StoreFolder, camera_path, existing_store, recordings_of
+from lab.cli.sources import Json, StoreFolder, camera_path, recordings_of
 from lab.errors import InputError
 
 if TYPE_CHECKING:

@@ -174,7 +174,8 @@ def place_of_test(file: Path) -> Path:
     return (tests if tests is not None and tests.is_dir() else file.parent) / f"test_{file.name}"
 
 
-def _class_name(name: str) -> str:
+def class_name(name: str) -> str:
+    """Return the name of an effect's class."""
     return "".join(part.capitalize() for part in name.split("_"))
 
 
@@ -240,7 +241,7 @@ from sim.stages import {state}
 
 {points}{_numbers("TABLE", found.table, f"{quantity[0].upper()}{quantity[1:]}.")}
 
-class {_class_name(name)}(Effect):
+class {class_name(name)}(Effect):
     """The table as it was found: {quantity}, by {law.along}."""
 
     name: ClassVar[str] = "{name}"
@@ -319,11 +320,11 @@ CAMERA = CameraModel(
     prnu_percent=0.0,
     quantum_efficiency={{"Y": Spectrum.of((400.0, 700.0), (0.5, 0.5))}}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
 )  # fmt: skip
-LAW = ({name}.{_class_name(name)}(strength=1.0),)
+LAW = ({name}.{class_name(name)}(strength=1.0),)
 {block}
 
 def test_absent_it_has_no_law() -> None:
-    assert not list_changes({name}.{_class_name(name)}())
+    assert not list_changes({name}.{class_name(name)}())
 
 
 def test_the_whole_law_is_the_table_that_was_found() -> None:

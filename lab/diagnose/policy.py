@@ -4,9 +4,9 @@ value comes from.
 Odds are natural logarithms throughout ("log odds"): 2.3 is ten to one, 4.6 is a hundred to one. A score is the gain in
 chi2 that an effect's signature promises: twice its log odds.
 
-Values marked `TUNED` have no derivation. They were set on tuning seeds of the challenge, and each states a value at
-which it doesn't act (`Rule.off`). `calibench challenge calibrate --each` takes them out one by one and counts right and
-false names of tuning cases; `--rule NAME=VALUE` scores the cases under any other value.
+Values marked `TUNED` have no derivation. They were set on tuning seeds of the evaluation, and each states a value at
+which it doesn't act (`Rule.off`). `python -m evaluation calibrate --each` takes them out one by one and counts right
+and false names of tuning cases; `--rule NAME=VALUE` scores the cases under any other value.
 docs/reference/decision-policy.md is generated from this module by docs/write_tables.py. It says, too, which numbers
 stay beside their use.
 """
@@ -21,7 +21,7 @@ from pydantic import Field
 from lab.formats.results import PolicyRule
 from sim.parameters import Frozen
 
-TUNED = "tuned: `calibench challenge calibrate`"
+TUNED = "tuned: `python -m evaluation calibrate`"
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class DecisionPolicy(Frozen):
     # --- significance -------------------------------------------------------------------------------------------------
     false_alarm_rate: float = rule("significance", 0.01, "1",
         "share of healthy cameras whose best score exceeds the threshold",
-        "chosen; checked by `calibench challenge score` on healthy cases, and per camera by `calibench diagnose "
+        "chosen; checked by `python -m evaluation score` on healthy cases, and per camera by `calibench diagnose "
         "--bootstrap`", most=1.0)
     threshold_draws: int = rule("significance", 400, "1",
         "draws of noise behind the threshold",
@@ -206,7 +206,7 @@ class DecisionPolicy(Frozen):
         most=1.0, off=0.0)
     search_cpu_s: float = rule("budget of the search", 120.0, "s",
         "CPU time of one side's search after which no further set is refitted, and no rival; these are listed",
-        "chosen: the challenge's limit for a whole diagnosis")
+        "chosen: the evaluation's limit for a whole diagnosis")
     rival_cosine: float = rule("budget of the search", 0.75, "1",
         "cosine of two whitened signatures from which on two effects are rivals",
         "at a non-centrality of 25 (detected in 93 % of cases) rivals are told apart in less than 95 %: Phi(0.5 "
@@ -339,7 +339,7 @@ class DecisionPolicy(Frozen):
         "chosen", most=1.0)
     least_rival_probability: float = rule("report", 0.005, "1",
         "least probability of a rival that is listed",
-        "half of `false_alarm_rate`; rival sets' coverage: `calibench challenge score`", most=1.0)
+        "half of `false_alarm_rate`; rival sets' coverage: `python -m evaluation score`", most=1.0)
     model_set_share: float = rule("report", 0.95, "1",
         "probability that the listed sets of effects hold together",
         "chosen; tests on linear problems: such sets hold the truth as often", most=1.0)

@@ -30,7 +30,8 @@ from sim.effects.base import Effect
 from sim.effects.distortion import Distortion
 from sim.effects.lateral_chromatic_aberration import REFERENCE_NM, LateralChromaticAberration
 from sim.effects.vignetting import Vignetting
-from sim.optics.illumination import RadialIllumination, optical_axis_px, relative_illumination
+from sim.optics.fall_off import RadialIllumination
+from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.scene.warp import distort
 from sim.spectrum import FloatArray
 
@@ -391,11 +392,26 @@ class _Calibrations:
         alike = [one for one in lines if one.get("model") == model]
         if len(alike) < len(lines):
             self.remarks.append(f"{kind}: {model} is read, {len(lines) - len(alike)} lines of other models aren't")
-        entries = tuple(self._entry(one, kind, model) for one in alike)
+        entries = self._last_of_each_place(kind, [self._entry(one, kind, model) for one in alike])
         if not self._serves(kind, sorted({one.focal_mm for one in entries})):
             return None
         half_mm = 0.5 * diagonals[at]
         return _Correction(kind, model, entries, half_mm, half_mm / math.hypot(1.0, self._aspect(having[at])))
+
+    def _last_of_each_place(self, kind: str, entries: Sequence[_Entry]) -> tuple[_Entry, ...]:
+        """Return the last calibration of each focal length, and of vignetting also aperture and distance, which is the
+        one that lensfun takes, and note places whose calibrations differ."""
+        last: dict[tuple[float, float, float], _Entry] = {}
+        for one in entries:
+            place = (one.focal_mm, one.aperture, one.distance_m)
+            other = last.get(place, one)
+            if not np.array_equal(other.terms, one.terms) or other.real_focal_mm != one.real_focal_mm:
+                self.remarks.append(
+                    f"{kind}: several calibrations at {one.focal_mm:g} mm differ, and the last one is taken, as "
+                    "lensfun does; remove those that don't apply"
+                )
+            last[place] = one
+        return tuple(last.values())
 
     def _serves(self, kind: str, focals_mm: list[float]) -> bool:
         """Return whether calibrations at these focal lengths serve the camera's, and note those that are used."""

@@ -97,7 +97,7 @@ MEAN_STD, MEAN_STD_DN = (
 )  # standard deviation of a frame's mean, of its signal and in DN: lamps are steady to some 1e-3
 CLIPPED_SHARE = 0.01  # of a frame's pixels, from which on its mean is a bound only
 SAME_SCATTER, LEAST_SAME = 4.0, 0.003  # standard deviations, and share of the signal, within which a frame has a level
-SAME_SATURATION, SAME_DN = 1e-3, 1.0  # the same beside it, of saturation, and at least
+SAME_SATURATION, SAME_DN = 1e-3, 1.0  # the same beside it, of saturation, and at least; of darks the latter alone
 APART = 3.0  # times that by which two levels that count as exchanged differ
 DARK_SIGMA = 6.0  # of the darks about their line
 SATURATED = 0.98  # of the highest mean, from which on a flat may saturate
@@ -156,10 +156,10 @@ def exchanged_frames(recordings: RecordingSet, side: Side) -> ExchangedFrames | 
     """Darks and flats of one side whose frames seem exchanged in pairs; None where none is found.
 
     Each flat has an expected level by the response that the others of its lamp and set point of the temperature follow
-    (`robust_response`, over captures), each dark by the line over the exposure of the darks of its temperature (Theil
-    and Sen). What another temperature explains is no evidence. Two captures seem exchanged where both are off their
-    levels and each has that of the other's setting. Levels nearer than `APART` tolerances can't be told apart. At most
-    a quarter of a lamp's captures may be wrong."""
+    (`robust_response`, over captures), each dark by the line over the exposure of the darks of its temperature
+    (Siegel's repeated medians). What another temperature explains is no evidence. Two captures seem exchanged where
+    both are off their levels and each has that of the other's setting. Levels nearer than `APART` tolerances can't be
+    told apart. At most a quarter of a lamp's captures may be wrong."""
     flats = recordings.captures(FlatCapture, side)
     if not flats:
         return None
@@ -201,7 +201,7 @@ def _judged(
             continue
         own = np.array([line.at(darks[number].exposure_s) for number in alike])
         away = np.abs(dark_mean[alike] - own)
-        tolerance = max(DARK_SIGMA * 1.4826 * float(np.median(away)), least)
+        tolerance = max(DARK_SIGMA * 1.4826 * float(np.median(away)), SAME_DN)
         found += [
             JudgedFrame(darks[number], float(dark_mean[number]), float(e), tolerance, bool(a > tolerance))
             for number, e, a in zip(alike, own, away, strict=True)
@@ -252,7 +252,9 @@ class _RobustLine:
 
 
 def _dark_lines(darks: Sequence[DarkCapture], mean_dn: FloatArray) -> dict[float | None, _RobustLine]:
-    """Return the line of Theil and Sen by temperature, deg C."""
+    """Return the line of Siegel's repeated medians by temperature, deg C: up to half of the darks may be off it.
+
+    Source: Siegel, Biometrika 69, 242 (1982)."""
     by_c: dict[float | None, list[int]] = {}
     for number, dark in enumerate(darks):
         by_c.setdefault(rounded_c(dark.temperature_c), []).append(number)
@@ -261,7 +263,7 @@ def _dark_lines(darks: Sequence[DarkCapture], mean_dn: FloatArray) -> dict[float
         exposure = np.array([darks[number].exposure_s for number in own])
         slope, black = 0.0, float(np.median(mean_dn[own]))
         if np.unique(exposure).size > 1:
-            slope, black = (float(v) for v in stats.theilslopes(mean_dn[own], exposure)[:2])
+            slope, black = (float(v) for v in stats.siegelslopes(mean_dn[own], exposure))
         lines[temperature_c] = _RobustLine(black, slope)
     return lines
 

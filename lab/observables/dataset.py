@@ -18,9 +18,12 @@ from lab.errors import NotDetermined
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import NoiseFit
 from lab.observables.acquisition_errors import CopiedFrames, copied_frames
-from lab.observables.codes.step import CodeStep, find_code_step
+from lab.observables.codes.step import CodeStep, find_code_step, under_highest_code
 from lab.observables.flats.stated_light import lamps_of, most_frequent_gain_db
 from lab.observables.noise.figures import NoiseFigures, noise_figures
+from lab.observables.noise.repeats import find_drifts
+from lab.observables.noise.side_levels import DarkLevels, dark_levels, flat_statistics, usual_darks
+from lab.observables.noise.stack import PlaneStatistics
 from lab.observables.plane_means import channel_means
 from lab.observables.reads import LAG, acting
 from sim.camera import CameraModel, Side
@@ -70,6 +73,7 @@ class Dataset:
         self.copies: CopiedFrames = copied_frames(recordings, side)
         self.recordings = recordings.without(self.copies.ids) if self.copies.ids else recordings
         code = find_code_step(self.recordings, side) if noise is None else CodeStep(noise.step_dn)
+        self._coded = under_highest_code(self.recordings, side, code)
         #: Step of the codes, DN.
         self.step_dn = code.step_dn
         camera = camera.model_copy(update={"white_level_dn": code.highest_dn(camera.white_level_dn)})
@@ -156,6 +160,17 @@ class Dataset:
         """Relative standard deviation of the light that the baseline's point spread function sends far; 1 where
         f-number or pixel pitch isn't stated."""
         return TAIL_STD if self.diffraction_is_known else 1.0
+
+    @cached_property
+    def darks(self) -> DarkLevels:
+        """Levels of the darks at the usual gain, with what the order of their repeats shows."""
+        flats = self.recordings.captures(FlatCapture, self.side)
+        found = dark_levels(self._coded, usual_darks(self.recordings, self.side), flats, self.step_dn)
+        return found.with_drifts(find_drifts(self.recordings, self.side, ("dark",)))
+
+    def flat_statistics(self, group: Sequence[FlatCapture]) -> dict[str, PlaneStatistics]:
+        """Return the statistics by plane of the repeats of one level of flats."""
+        return flat_statistics(self._coded, group, self.darks, self.step_dn)
 
     @cached_property
     def lamps(self) -> dict[str, int]:

@@ -18,6 +18,7 @@ import numpy as np
 import lab.observables
 from sim.effects.base import Effect, Effects
 from sim.effects.library import may_change
+from sim.extensions import extensions, refuse
 from sim.spectrum import FloatArray
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ class Observable:
         return not self.scattered_by.isdisjoint(may_change(effect))
 
 
-# --- All measurements: every module of this package is searched for declarations (`Measurement`) ----------------------
+# --- All measurements: every module of this package is searched for declarations (`Measurement`), and entry points ----
 
 
 @cache
@@ -132,6 +133,13 @@ def measurements() -> tuple[Measurement, ...]:
         for item in vars(content).values():
             if isinstance(item, Measurement) and found.setdefault(item.name, item) is not item:
                 raise ValueError(f"two measurements are named {item.name!r}: give one another name")
+    for name, item in extensions("observables"):
+        if not isinstance(item, Measurement):
+            refuse("observables", name, f"{item!r} is no lab.observables.observable.Measurement")
+        elif item.name in found:
+            refuse("observables", name, f"there is a measurement {item.name!r} already")
+        else:
+            found[item.name] = item
     return tuple(sorted(found.values(), key=lambda one: (one.order, one.name)))
 
 

@@ -19,9 +19,12 @@ import numpy as np
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
     Check,
+    CurveComparison,
     DiagnosisResult,
+    MtfCurve,
     NoiseFit,
     PatchComparison,
+    PhotonTransfer,
     RepeatDrift,
     ResidualCurve,
     SpectralFit,
@@ -30,6 +33,7 @@ from lab.formats.results.words import measured, plain_number
 from lab.observables.observable import measurement_title
 from lab.predict.validate import SensitivityCurve
 from sim.camera import Side
+from sim.spectrum import Spectrum
 
 Figure = dict[str, Any]
 Trace = dict[str, Any]
@@ -121,9 +125,15 @@ def band(
 
 def photon_transfer(noise: NoiseFit) -> Figure | None:
     """Temporal variance against signal, with the line of the fitted conversion gain."""
-    points = noise.photon_transfer
-    if points is None:
+    if noise.photon_transfer is None:
         return None
+    return photon_transfer_points(
+        noise.photon_transfer, noise.conversion_gain_dn_per_e, noise.conversion_gain_dn_per_e_std
+    )
+
+
+def photon_transfer_points(points: PhotonTransfer, gain: float | None = None, gain_std: float | None = None) -> Figure:
+    """Return temporal variance against signal, with the line of a conversion gain (DN/e) where it is given."""
     data: list[Trace] = []
     for channel in dict.fromkeys(points.channel):
         for used in (True, False):
@@ -144,13 +154,12 @@ def photon_transfer(noise: NoiseFit) -> Figure | None:
                 }
             )
     top = max(points.signal_dn)
-    if noise.conversion_gain_dn_per_e is not None:
-        gain = noise.conversion_gain_dn_per_e
+    if gain is not None:
         data.append(
             {
                 "type": "scatter",
                 "mode": "lines",
-                "name": f"slope {measured(gain, noise.conversion_gain_dn_per_e_std, 'DN/e')}",
+                "name": f"slope {measured(gain, gain_std, 'DN/e')}",
                 "x": [0.0, top],
                 "y": [0.0, gain * top],
                 "line": {"color": "@fg", "width": 1.5, "dash": "dash"},
@@ -276,15 +285,15 @@ def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[
 
 def quantum_efficiency(
     spectral: SpectralFit,
-    recordings: RecordingSet,
-    side: Side,
+    recordings: RecordingSet | None = None,
+    side: Side = "left",
     models: Mapping[str, SensitivityCurve] | None = None,
 ) -> Figure:
     """Return the quantum efficiency with its band (standard deviation times the fit's coverage factor) and the
     wavelength bands in which it differs from the maker's.
 
     `models`: curves of the baseline and the improved model by channel, drawn beside it. Without them, the maker's curve
-    stands there, scaled by the fitted factor where there is one.
+    that the recordings state, scaled by the fitted factor where there is one.
     """
     data: list[Trace] = []
     scale = spectral.maker_scale or 1.0
@@ -316,15 +325,18 @@ def quantum_efficiency(
                 {"type": "scatter", "mode": "lines", "x": list(curve.wavelength_nm), "y": list(drawn), "line": line}
                 | {"showlegend": False, "name": f"{channel}, {name}"}
             )
-    for channel, path in ({} if models else recordings.camera(side).quantum_efficiency or {}).items():
-        stated = recordings.spectrum(path)
+    stated: dict[str, Spectrum] = {}
+    if recordings is not None and not models:
+        files = recordings.camera(side).quantum_efficiency or {}
+        stated = {channel: recordings.spectrum(path) for channel, path in files.items()}
+    for channel, maker in stated.items():
         data.append(
             {
                 "type": "scatter",
                 "mode": "lines",
                 "name": f"{channel}, maker" + (f" x {scale:.3f}" if spectral.maker_scale else ""),
-                "x": list(stated.wavelength_nm),
-                "y": [scale * value for value in stated.value],
+                "x": list(maker.wavelength_nm),
+                "y": [scale * value for value in maker.value],
                 "line": {"color": CHANNEL.get(channel, "#888888"), "width": 1.2, "dash": "dot"},
             }
         )
@@ -469,6 +481,72 @@ def transfer_overlays(
     return {
         "data": data,
         "layout": layout(height, annotations=titles, **panes) | {"legend": legend, "margin": margin},
+    }
+
+
+def mtf_curves(curves: Sequence[MtfCurve]) -> Figure:
+    """Return modulation transfer functions with bands of one standard deviation, spatial frequency in cy/px."""
+    data: list[Trace] = []
+    for curve in curves:
+        colour = CHANNEL.get(curve.channel, "#888888")
+        data.append(band(curve.frequency_cy_per_px, np.asarray(curve.mtf), np.asarray(curve.mtf_std), colour))
+        line = {"color": colour, "width": 1.8}
+        data.append(
+            {"type": "scatter", "mode": "lines", "name": f"{curve.channel}, {curve.capture}", "line": line}
+            | {"x": list(curve.frequency_cy_per_px), "y": list(curve.mtf)}
+        )
+    highest = max(max(curve.mtf) for curve in curves)
+    return {
+        "data": data,
+        "layout": layout(
+            300,
+            xaxis=axis("spatial frequency, cy/px", rangemode="tozero"),
+            yaxis=axis("MTF", range=[-0.02, max(1.05, 1.05 * highest)]),
+        ),
+    }
+
+
+def predicted_curves(curves: Sequence[CurveComparison]) -> Figure:
+    """Return measured curves (points with one standard deviation) and their predictions (lines) on one axis."""
+    data: list[Trace] = []
+    for curve in curves:
+        colour = CHANNEL.get(curve.channel, "#888888")
+        at = {"type": "scatter", "x": list(curve.x)}
+        line = {"color": colour, "width": 1.8, "dash": "dash"}
+        data.append(
+            at | {"mode": "lines", "name": f"{curve.channel} predicted", "y": list(curve.predicted)} | {"line": line}
+        )
+        data.append(
+            at
+            | {"mode": "markers", "name": f"{curve.channel} measured", "y": list(curve.measured)}
+            | {"error_y": error_bars(curve.measured_std, colour), "marker": {"color": colour, "size": 4}}
+        )
+    return {"data": data, "layout": layout(300, xaxis=axis(curves[0].axis), yaxis=axis("MTF", rangemode="tozero"))}
+
+
+def predicted_patches(patches: Sequence[PatchComparison]) -> Figure:
+    """Return predicted against measured signals of a chart's patches, DN above black, by channel; bars: one standard
+    deviation of both together."""
+    data: list[Trace] = []
+    top = max(max(patch.measured_dn, patch.predicted_dn) for patch in patches)
+    line = {"color": "@muted", "width": 1.0, "dash": "dash"}
+    data.append({"type": "scatter", "mode": "lines", "name": "equal", "x": [0.0, top], "y": [0.0, top], "line": line})
+    for channel in dict.fromkeys(patch.channel for patch in patches):
+        mine = [patch for patch in patches if patch.channel == channel]
+        colour = CHANNEL.get(channel, "#888888")
+        std = [float(np.hypot(one.measured_dn_std, one.predicted_dn_std)) for one in mine]
+        data.append(
+            {"type": "scatter", "mode": "markers", "name": channel, "text": [patch.patch for patch in mine]}
+            | {"x": [patch.measured_dn for patch in mine], "y": [patch.predicted_dn for patch in mine]}
+            | {"error_y": error_bars(std, colour), "marker": {"color": colour, "size": 6}}
+        )
+    return {
+        "data": data,
+        "layout": layout(
+            300,
+            xaxis=axis("measured above black, DN", rangemode="tozero"),
+            yaxis=axis("predicted above black, DN", rangemode="tozero"),
+        ),
     }
 
 

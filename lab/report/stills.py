@@ -1,8 +1,8 @@
 """The first screen's charts as static SVG: what a print shows that is made before the page's script has drawn, a reader
 without scripts sees, and everybody does until the script draws the chart proper in its place.
 
-Of Plotly's figures it knows what those charts have: scatter traces with lines, markers and error bars on one abscissa
-and ordinates one above the other, and rectangles across the whole width.
+Of Plotly's figures it knows what those charts have: scatter traces with lines, markers, error bars and bands on one
+abscissa and ordinates one above the other, and rectangles across the whole width.
 """
 
 from __future__ import annotations
@@ -124,6 +124,10 @@ def _dots(points: Iterable[tuple[float, float]], marker: dict[str, Any]) -> str:
 
 
 def _trace(trace: Trace, x_of: _Scale, y_of: _Scale) -> Iterator[str]:
+    if trace.get("fill") == "toself":  # an uncertainty band
+        outline = "L".join(f"{x_of(x):.1f} {y_of(y):.1f}" for x, y, _ in _pairs(trace, ""))
+        yield f'<path d="M{outline}Z" style="{_style(fill=trace["fillcolor"], stroke="none")}"/>'
+        return
     bars = [
         f"M{x_of(x):.1f} {y_of(y - half):.1f}V{y_of(y + half):.1f}" for x, y, half in _pairs(trace, "error_y") if half
     ]
@@ -199,6 +203,8 @@ def still(figure: Figure, number: int) -> Markup:
         parts += [part for trace in mine for part in _trace(trace, x_of, y_of)]
         parts.append("</g>")
     for note in layout.get("annotations", ()):
+        if note.get("xref") != "paper":
+            continue  # stands at a place of the data, and needs the chart proper
         x, y = LEFT + note["x"] * (x_of.end - LEFT), bottom - note["y"] * (bottom - top)
         colour = f' style="{_style(fill=note["font"]["color"])}"'
         parts.append(_text(x, y - 3, note["text"], size=note["font"]["size"], more=colour))

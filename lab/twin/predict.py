@@ -32,7 +32,8 @@ from lab.observables.dataset import Dataset
 from lab.observables.edges.slanted_edge import ASIDE, SLANTED_EDGE
 from lab.observables.flats.linearity import PHOTON_TRANSFER, misstated_levels
 from lab.observables.flats.noise import GAIN_STD, NOISE, READ_STD, shot_variance
-from lab.observables.noise.figures import BLACK_FLOOR_DN, USUAL_LAMP, NoiseFigures
+from lab.observables.noise.figures import BLACK_FLOOR_DN, USUAL_JITTER_DN, NoiseFigures
+from lab.observables.noise.repeatability import USUAL_LAMP
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.one_blas_thread import one_blas_thread
 from lab.twin.changes import Changes, carried, doubling_std_c, reference_temperature_c
@@ -55,8 +56,6 @@ NYQUIST_CY_PER_PX = 0.5
 NEAR_FULL = 0.985
 #: Share of saturation above which a level isn't predicted, as some of its pixels clip.
 HIGHEST_SHARE = 0.95
-#: Usual scatter of a dark frame's mean, DN, where the model doesn't say.
-USUAL_JITTER_DN = 0.02
 #: Relative standard deviation of the sensitivities where the model has none.
 CURVE_STD = 0.01
 #: What is fitted of the recordings that levels are relative to.
@@ -282,7 +281,7 @@ def _dataset(
     noise = NoiseFigures(
         black=camera.black_level_dn, dark_dn_per_s=dark * gain, dark_c=reference_c, gain=gain, gain_is_known=True,
         read_dn=float(np.sqrt(max(first.read_noise_dn**2 - rounding_dn2, 0.0) * amplified**2 + rounding_dn2)),
-        prnu=0.01 * camera.prnu_percent, jitter_dn=max(first.level_jitter_dn, BLACK_FLOOR_DN), jitter_freedom=0.0,
+        prnu=0.01 * camera.prnu_percent, jitter_dn=max(first.level_jitter_dn, BLACK_FLOOR_DN), jitter_dn2_std=0.0,
         jitter_lamp=first.lamp_jitter, black_std=first.black_level_std_dn,
         dark_std=first.dark_current_std_dn_per_s * amplified * growth, step_dn=first.code_step_dn,
     )  # fmt: skip

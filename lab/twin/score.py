@@ -21,6 +21,7 @@ from lab.observables.flats.linearity import PHOTON_TRANSFER
 from lab.observables.gaussian import chi2
 from lab.observables.observable import Label, measurement_title
 from lab.one_blas_thread import one_blas_thread
+from lab.shown import Tabular
 from lab.twin.predict import QUANTITIES, is_predicted, measured_blocks
 from lab.twin.sealed import PredictedName, PredictedNumber, SealedPrediction, SidePrediction, TwinNumber
 from sim.camera import CameraModel, Side
@@ -122,7 +123,7 @@ class TestedEffect(Frozen):
         return f"{title}: {self.verdict} (log likelihood {self.gain:+.1f})"
 
 
-class TwinScore(Frozen):
+class TwinScore(Tabular, Frozen):
     """The result of `calibench twin score`."""
 
     format: Literal["calibench-twin-score"] = "calibench-twin-score"

@@ -13,6 +13,7 @@ from lab.formats.raw_file import replacing
 from lab.formats.recording_set import DataSheet
 from lab.formats.result_file import read_result
 from lab.formats.results import Skipped
+from lab.shown import Tabular
 from lab.twin.changes import Changes
 from sim.camera import Side
 from sim.parameters import Frozen
@@ -90,7 +91,7 @@ class SidePrediction(Frozen):
     skipped: tuple[Skipped, ...] = ()
 
 
-class SealedPrediction(Frozen):
+class SealedPrediction(Tabular, Frozen):
     """What `calibench twin predict` writes."""
 
     format: Literal["calibench-twin"] = "calibench-twin"

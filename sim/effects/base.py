@@ -137,7 +137,7 @@ class Effect(Frozen):
         Each inner tuple is one set of signatures that may be combined with coefficients >= 0 (a two-sided parameter
         gives both signs). Several inner tuples are alternatives (an effect without a derivative at `absent`, such as a
         filter's edge, gives one for each place it may lie). The default is one set: 0.3 standard deviations of each
-        parameter's prior from `absent`, within its bounds.
+        parameter's prior from `absent`, within its bounds; of one that acts as its square, to one side.
         """
         steps: list[Self] = []
         for field, quantity in cls.quantities_of(camera).items():
@@ -145,7 +145,7 @@ class Effect(Frozen):
                 continue
             absent = quantity.absent or 0.0
             size = quantity.prior[1] if quantity.prior is not None else 1.0
-            for sign in (1.0, -1.0):
+            for sign in (1.0, -1.0) if quantity.linear_power != 2 else (1.0,):
                 value = absent + sign * 0.3 * size
                 if (quantity.lower is None or value >= quantity.lower) and (
                     quantity.upper is None or value <= quantity.upper

@@ -25,7 +25,9 @@ class ChargeTransferInefficiency(Effect):
     more often, so that its trail is longer in proportion. Traps of a second species take `slow_share` of it.
 
     Traps take electrons one by one, so that the shot noise of what arrives is independent from pixel to pixel. Where
-    the same share of every packet lags behind, noise moves with it: neighbours share it (`noise`).
+    the same share of every packet lags behind, noise moves with it: neighbours share it (`noise`). Where capture is
+    fast and each packet fills the traps to its own level, all that it finds is what the one before has left, whatever
+    their release: the noise of that one goes to the next alone (Massey et al., section 2).
 
     The law of small packets, whose cloud grows with them: of traps that are always full, or of a cloud of constant
     volume, the loss isn't in proportion, and faint packets lose more.
@@ -76,8 +78,11 @@ class ChargeTransferInefficiency(Effect):
                  logarithmic=True, dispensable=True),
     ] = 20.0  # fmt: skip
     noise: Annotated[
-        Literal["single electrons", "moves along"],
-        Field(description="shot noise of single electrons in traps, or of a share of every packet that lags behind"),
+        Literal["single electrons", "moves along", "to the next packet"],
+        Field(
+            description="shot noise of single electrons in traps, of a share of every packet that lags behind, or of "
+            "one that the next packet takes over as a whole"
+        ),
     ] = "single electrons"
     first_row: Annotated[Literal["top", "bottom"], Field(description="end of the frame whose row is read first")] = (
         "top"
@@ -97,7 +102,7 @@ class ChargeTransferInefficiency(Effect):
                                     "first_column": column, "noise": noise} | size)
                 for size in ({"parallel_ppm": parallel_ppm}, {"serial_ppm": serial_ppm})
             )
-            for noise in ("single electrons", "moves along") for row, column in ends
+            for noise in ("single electrons", "moves along", "to the next packet") for row, column in ends
         )  # fmt: skip
 
     def _releases(self, release_px: float) -> tuple[tuple[float, float], ...]:
@@ -115,7 +120,7 @@ class ChargeTransferInefficiency(Effect):
             charge = charge.add_laws(
                 trails=Trails(1, 1e-6 * self.serial_ppm, self._releases(self.serial_release_px), output)
             )
-        if self.noise == "moves along":
+        if self.noise != "single electrons":
             charge = self._share_noise(charge)
         return charge
 
@@ -131,8 +136,9 @@ class ChargeTransferInefficiency(Effect):
             (self.parallel_ppm, self.release_px, camera.rows),
         ):
             lost = 1e-6 * ppm * 0.5 * (lines + 1.0)
-            beside = sum(share * (1.0 - np.exp(-1.0 / release)) for share, release in self._releases(release_px))
-            shares.append((min(lost, 0.4), min(lost, 0.4) * float(beside)))
+            released = sum(share * (1.0 - np.exp(-1.0 / release)) for share, release in self._releases(release_px))
+            beside = float(released) if self.noise == "moves along" else 1.0
+            shares.append((min(lost, 0.4), min(lost, 0.4) * beside))
         lost_share = sum(lost for lost, _ in shares)
         next_share = np.zeros(len(NEIGHBOURS))  # of further ones to first order none
         next_share[:2] = [beside for _, beside in shares]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
@@ -10,6 +11,7 @@ from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.parameters import Quantity
+from sim.sensor.electrons import Multiplication
 from sim.stages import Charge
 
 
@@ -19,9 +21,9 @@ class ExcessNoise(Effect):
     from some tens on, as in EM registers. Where holes multiply, too, as in avalanche diodes, it is above 2.
 
     By the slope of variance over mean, F^2 and the conversion gain are one number. Three things tell them apart: levels
-    of light of known radiance (the gain is by F^2 too high for them); the skewness of the noise (a single electron's
-    charge is distributed nearly exponentially); and flats at two settings of a register's gain, over which F^2 changes
-    as the law says, but a conversion gain in proportion to the setting (`gain_setting`).
+    of light of known radiance (the gain is by F^2 too high for them); the skewness of the noise, as a single electron's
+    charge is distributed between a geometric and a gamma distribution; and flats at two settings of a register's gain,
+    over which F^2 changes as the law says, but a conversion gain in proportion to the setting (`gain_setting`).
     """
 
     name: ClassVar[str] = "excess_noise"
@@ -31,6 +33,7 @@ class ExcessNoise(Effect):
         "performance of electron multiplying charge-coupled devices, IEEE Trans. Electron Devices 50 (2003) 1227"
     )
     form_tolerance: ClassVar[float] = 0.03
+    forms: ClassVar[Mapping[str, object]] = {"distribution": "gamma"}
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "exposure", "wavelength", "field", "level", "orientation", "time"}
     )
@@ -42,8 +45,11 @@ class ExcessNoise(Effect):
     excess_percent: Annotated[
         float,
         Quantity("%", "variance of the shot noise beyond that of single electrons, at a gain setting of 0 dB",
-                 lower=0.0, upper=900.0, prior=(0.0, 50.0), absent=0.0),
+                 lower=0.0, upper=900.0, prior=(0.0, 100.0), absent=0.0),
     ] = 0.0  # fmt: skip
+    distribution: Annotated[
+        Literal["geometric", "gamma"], Field(description="distribution of a single electron's charge")
+    ] = "geometric"
     gain_setting: Annotated[
         Literal["after the multiplication", "of the multiplication"],
         Field(description="what the camera's gain setting amplifies"),
@@ -66,4 +72,4 @@ class ExcessNoise(Effect):
     def on_charge(self, charge: Charge) -> Charge:
         if self.excess_percent == 0.0:
             return charge
-        return charge.add_laws(excess=self.factor)
+        return charge.add_laws(excess=lambda gain_db: Multiplication(self.factor(gain_db), self.distribution))

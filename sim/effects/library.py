@@ -1,15 +1,18 @@
-"""All effects, discovered: every module of this package is searched for subclasses of `Effect`."""
+"""All effects, discovered: every module of this package is searched for subclasses of `Effect`, and other packages add
+theirs by entry points of the group `calibench.effects`."""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Collection
 from functools import cache, lru_cache
 
 import sim.effects
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.families import Family
+from sim.extensions import extensions, refuse
 from sim.spectrum import Spectrum
 from sim.stages import laws_of
 
@@ -28,7 +31,21 @@ def effects() -> dict[str, type[Effect]]:
                 and "name" in vars(item)  # not a base of several
             ):
                 found[item.name] = item
+    for name, kind in extensions("effects"):
+        if (why := _why_refused(name, kind, found)) is not None:
+            refuse("effects", name, why)
+        else:
+            found[name] = kind
     return dict(sorted(found.items()))
+
+
+def _why_refused(name: str, kind: object, known: Collection[str]) -> str | None:
+    """Return why another package's object can't be an effect; None: it can."""
+    if not (isinstance(kind, type) and issubclass(kind, Effect)):
+        return f"{kind!r} is no subclass of sim.effects.base.Effect"
+    if kind.__dict__.get("name") != name:
+        return f"its entry point's name isn't that of the effect, {kind.__dict__.get('name')!r}"
+    return f"there is an effect {name!r} already" if name in known else None
 
 
 def effect(name: str) -> type[Effect]:

@@ -30,7 +30,7 @@ class MoffatBlur(Effect):
     title: ClassVar[str] = "Moffat blur"
     family: ClassVar[Family] = Family.ISOTROPIC_CONTRAST
     reference: ClassVar[str] = "A. Moffat, Astron. Astrophys. 3, 455 (1969); I. Trujillo et al., MNRAS 328, 977 (2001)"
-    form_tolerance: ClassVar[float] = 0.1
+    form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "exposure", "wavelength", "field", "level", "orientation", "time"}
     )
@@ -42,7 +42,7 @@ class MoffatBlur(Effect):
 
     radius_um: Annotated[
         float,
-        Quantity("um", "radius a of the spread's core", lower=0.0, upper=20.0, prior=(0.0, 0.3), absent=0.0),
+        Quantity("um", "radius a of the spread's core", lower=0.0, upper=100.0, prior=(0.0, 1.0), absent=0.0),
     ] = 0.0
     share_percent: Annotated[
         float,
@@ -60,7 +60,7 @@ class MoffatBlur(Effect):
     @classmethod
     def limits(cls, camera: CameraModel) -> dict[str, tuple[float, float]]:
         """A wider core's light is a veil to detail of some pixels (`veiling_glare`)."""
-        return {"radius_um": (0.0, min(20.0, 3.0 * camera.pixel_pitch_um))}
+        return {"radius_um": (0.0, min(100.0, 3.0 * camera.pixel_pitch_um))}
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:

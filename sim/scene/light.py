@@ -8,6 +8,7 @@ from types import ModuleType
 
 import numpy as np
 
+from sim.extensions import extensions, refuse
 from sim.scene.screen import Screen, SubPixels
 from sim.spectrum import FloatArray, Spectrum
 
@@ -52,16 +53,30 @@ def at_luminance(curve: Spectrum, wanted_cd_m2: float) -> Spectrum:
     return curve.scale(wanted_cd_m2 / has)
 
 
+def _added_illuminants() -> dict[str, Spectrum]:
+    """Return the illuminants of other packages, by name in small letters: entry points of `calibench.illuminants` that
+    are spectra."""
+    found = {}
+    for name, spectrum in extensions("illuminants"):
+        if isinstance(spectrum, Spectrum):
+            found[name.lower()] = spectrum
+        else:
+            refuse("illuminants", name, f"{spectrum!r} is no sim.spectrum.Spectrum")
+    return found
+
+
 def illuminant(name: str, luminance_cd_m2: float) -> Spectrum:
     """Radiance (W sr^-1 m^-2 nm^-1) of a perfect white diffuser under a named illuminant (D65, A, FL2, LED-B1, ...), at
     the given luminance. Raises ValueError that lists the names for one that isn't known.
     """
     known = colour_science().SDS_ILLUMINANTS
     matching = {key.lower(): key for key in known}
+    added = _added_illuminants()
+    if name.lower() not in matching and name.lower() in added:
+        return at_luminance(added[name.lower()], luminance_cd_m2)
     if name.lower() not in matching:
-        raise ValueError(
-            f"illuminant {name!r} is not known: name one of {', '.join(known)}, or a CSV file of a measured light"
-        )
+        names = ", ".join([*known, *added])
+        raise ValueError(f"illuminant {name!r} is not known: name one of {names}, or a CSV file of a measured light")
     curve = known[matching[name.lower()]]
     return at_luminance(Spectrum.of(curve.wavelengths, curve.values), luminance_cd_m2)
 

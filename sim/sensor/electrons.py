@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,47 @@ class Amplifiers(Protocol):
         """Return the read noise, which is coupled or not."""
 
 
+#: Variance factor of a multiplication above which it is taken as continuous: the mean is then 50 and more.
+GEOMETRIC_BELOW = 1.98
+
+
+@dataclass(frozen=True)
+class Multiplication:
+    """The random multiplication of single electrons, over its mean: a number of mean 1 and variance `excess` - 1.
+
+    "geometric": of mean M = 1 / (2 - excess) below 2, as a chain of many stages makes of one electron; from there on
+    "gamma", at 2 the exponential law of a register of high gain (Basden, Haniff and Mackay, MNRAS 345, 985, 2003).
+    "gamma": of any excess, as avalanche photodiodes are described.
+    """
+
+    excess: float = 1.0
+    distribution: Literal["geometric", "gamma"] = "geometric"
+
+    @property
+    def is_gamma(self) -> bool:
+        """Return whether the number is drawn from a gamma distribution."""
+        return self.distribution == "gamma" or self.excess > GEOMETRIC_BELOW
+
+    @property
+    def skewness(self) -> float:
+        """Return E g^3 / (E g^2)^2 of the number g: 1 of none, 1.5 of an exponential one."""
+        if self.is_gamma:
+            return 2.0 - 1.0 / self.excess
+        return 1.0 + 2.0 / self.excess - 2.0 / self.excess**2
+
+    def draw(self, charge: Float32Array, rng: np.random.Generator) -> Float32Array:
+        """Return electrons of the same shape, each multiplied, over the mean multiplication."""
+        if self.is_gamma:
+            spread = self.excess - 1.0
+            return np.asarray(rng.gamma(np.maximum(charge, 0.0) / spread, spread), np.float32)
+        number, inverse_mean = np.rint(np.maximum(charge, 0.0)), 2.0 - self.excess
+        further = rng.negative_binomial(np.maximum(number, 1.0), inverse_mean)
+        return np.asarray(np.where(number > 0.0, (number + further) * inverse_mean, charge), np.float32)
+
+
+NO_MULTIPLICATION = Multiplication()
+
+
 @dataclass(frozen=True)
 class ReadOut:
     """Changes of the read-out by effects; by default a linear read-out.
@@ -56,7 +97,7 @@ class ReadOut:
     offset_dn     added to the black level
     gain          factor (rows, cols) on what is read of every pixel, its noise alike, before `added`
     read_kernel   kernel (odd,) along the row that makes read noise of white noise
-    excess        factor on the shot noise's variance, by which each electron is multiplied at random
+    multiplied    how each electron is multiplied at random
     amplifiers    what coupled amplifiers read of the signals of a whole frame in electrons
     """
 
@@ -71,7 +112,7 @@ class ReadOut:
     processing: FloatArray | None = None
     gain: FloatArray | None = None
     read_kernel: FloatArray | None = None
-    excess: float = 1.0
+    multiplied: Multiplication = NO_MULTIPLICATION
     amplifiers: Amplifiers | None = None
 
 
@@ -262,8 +303,8 @@ def dn_moments(
     full_dn = zero_dn + gain * float(full if read_out.response is None else read_out.response(full))
     by_charge = full_dn < camera.white_level_dn
     noise = electrons if read_out.shot_e2 is None else np.maximum(read_out.shot_e2(electrons), 0.0)
-    if read_out.excess != 1.0:
-        noise = noise * read_out.excess
+    if read_out.multiplied.excess != 1.0:
+        noise = noise * read_out.multiplied.excess
     mean, variance = electrons, noise
     if by_charge:
         # to DN as it is, as the full well's own noise is none: what is clipped isn't clipped again
@@ -397,8 +438,8 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
         shares = passed_shares(read_out.neighbours, mean.astype(float))
         charge = (mean + shared_departures(charge - mean, mean, shares)).astype(np.float32)
     np.minimum(charge, np.float32(camera.full_well_e), out=charge)
-    if read_out.excess != 1.0:
-        charge = multiply_electrons(charge, read_out.excess, rng)
+    if read_out.multiplied.excess != 1.0:
+        charge = read_out.multiplied.draw(charge, rng)
     if read_out.response is not None:
         charge = read_out.response(charge.astype(float)).astype(np.float32)
     if read_out.amplifiers is not None:
@@ -447,30 +488,6 @@ def _products() -> tuple[tuple[tuple[int, int], ...], ...]:
 
 
 _PRODUCTS = _products()
-#: Variance factor of a multiplication above which it is taken as continuous: the mean is then 50 and more.
-GEOMETRIC_BELOW = 1.98
-
-
-def multiplied_skewness(excess: float) -> float:
-    """Return E g^3 / (E g^2)^2 of the number g by which `multiply_electrons` multiplies one electron: 1 of none, 1.5 of
-    an exponential one."""
-    if excess > GEOMETRIC_BELOW:
-        return 2.0 - 1.0 / excess
-    return 1.0 + 2.0 / excess - 2.0 / excess**2
-
-
-def multiply_electrons(charge: Float32Array, excess: float, rng: np.random.Generator) -> Float32Array:
-    """Electrons after each was multiplied at random, over the mean multiplication; the variance of one is `excess` - 1.
-
-    Below 2 a geometric number of mean M = 1 / (2 - excess), as a chain of many stages makes of one electron. From there
-    on a gamma distribution: at 2 the exponential one of a register of high gain (Basden, Haniff and Mackay, MNRAS 345,
-    985, 2003)."""
-    if excess > GEOMETRIC_BELOW:
-        spread = excess - 1.0
-        return np.asarray(rng.gamma(np.maximum(charge, 0.0) / spread, spread), np.float32)
-    number, inverse_mean = np.rint(np.maximum(charge, 0.0)), 2.0 - excess
-    further = rng.negative_binomial(np.maximum(number, 1.0), inverse_mean)
-    return np.asarray(np.where(number > 0.0, (number + further) * inverse_mean, charge), np.float32)
 
 
 def solve_passed_share(correlation: FloatArray) -> FloatArray:
@@ -479,6 +496,8 @@ def solve_passed_share(correlation: FloatArray) -> FloatArray:
     sum is over the neighbours a and b that lie as far apart as the two pixels. Solved by fixed-point steps.
     """
     r = np.clip(np.asarray(correlation, float), -0.49, 0.49)
+    if not r.any():
+        return np.zeros(r.shape)
     counts = [len(places) for places in NEIGHBOURS]
     g = 0.5 * r
     for _ in range(SHARE_STEPS):

@@ -78,11 +78,13 @@ class OrderedNoise:
         """Return the variance of a pixel."""
         return self.noise_e**2 + self.alternating_e**2
 
+    def _mixed(self, response: FloatArray) -> FloatArray:
+        """What noise shows, from the responses (2, ...) to the common and to the alternating kind of 1 e each."""
+        return np.asarray(self.noise_e**2 * response[0] + self.alternating_e**2 * response[1])
+
     def spectrum_e2(self, frequency_cy_per_px: FloatArray) -> FloatArray:
         """Power at frequencies in reading order, e^2; its mean over -0.5..0.5 cy/px is the variance."""
-        f = _from_whole(np.asarray(frequency_cy_per_px, float))
-        common, apart = (self._shape.power(away) for away in (f, _from_whole(2.0 * f)))
-        return self.noise_e**2 * common + self.alternating_e**2 * apart
+        return self._mixed(_spectrum(self._shape, np.asarray(frequency_cy_per_px, float)))
 
     def plane_e2(self, shape: tuple[int, int], across_cy_per_px: FloatArray, down_cy_per_px: FloatArray) -> FloatArray:
         """Expected periodogram |FFT|^2 / pixels of a frame (rows, cols) at frequencies across the columns and down the
@@ -92,91 +94,146 @@ class OrderedNoise:
         row it is one of (d + m) / cols, m = 0..cols - 1. Across, a row shows it through its Dirichlet kernel. Down the
         rows the spectrum is smooth but at its poles, which leak (`_leaking`).
         """
-        cols = shape[1]
         across, down = np.broadcast_arrays(np.asarray(across_cy_per_px, float), np.asarray(down_cy_per_px, float))
-        make = _kept_row_waves if across.size * cols <= KEPT_WAVES else _row_waves
-        waves, kernel = make(across.tobytes(), down.tobytes(), across.shape, cols)
-        return np.asarray(np.sum(kernel * self._shown(waves, shape), axis=-1))
-
-    def _shown(self, waves_cy_per_px: FloatArray, shape: tuple[int, int]) -> FloatArray:
-        """The spectrum as frames show it, which end: near a pole, with what leaks down the rows."""
-        rows, cols = shape
-        f = _from_whole(waves_cy_per_px)
-        own = []
-        for away, across in ((f, cols), (_from_whole(2.0 * f), cols // 2)):
-            near = _leaking((rows, across), self._shape)
-            cycles = away * across * rows  # a frame, or its even or odd columns
-            smooth = self._shape.power(np.maximum(cycles, 0.5) / (rows * across))
-            own.append(np.where(cycles < 0.5 * rows, np.interp(cycles, np.arange(len(near)), near), smooth))
-        return np.asarray(self.noise_e**2 * own[0] + self.alternating_e**2 * own[1])
+        return self._mixed(_plane(self._shape, shape, across.tobytes(), down.tobytes(), across.shape))
 
     def along_rows_e2(self, shape: tuple[int, int], across_cy_per_px: FloatArray) -> FloatArray:
-        """Mean over all rows of their periodograms, at frequencies across the columns."""
-        rows, cols = shape
-        down = np.arange(min(rows, 64)) / min(rows, 64)
-        return np.asarray(self.plane_e2((min(rows, 64), cols), np.asarray(across_cy_per_px)[:, None], down).mean(-1))
+        """Mean over all rows of their expected periodograms, at frequencies across the columns: the transform of the
+        covariance in a row, of which 1 - |lag| / cols pairs are there."""
+        return self._mixed(_along_rows(self._shape, shape[1], np.asarray(across_cy_per_px, float).tobytes()))
 
     def along_columns_e2(self, shape: tuple[int, int], down_cy_per_px: FloatArray) -> FloatArray:
         """Mean over the waves across the columns, of 1 to cols / 2 cycles, of a frame's periodogram at frequencies down
         the rows."""
         cols = shape[1]
         down = np.asarray(down_cy_per_px, float)
-        waves = (down[:, None] + np.arange(cols)) / cols
-        whole = self._shown(waves, shape).sum(axis=1)
+        whole = self._mixed(_down_rows(self._shape, shape, down.tobytes()))
         # waves across and back are one but for those of no and of cols / 2 cycles
         still, alternating = (self.plane_e2(shape, np.full(len(down), across), down) for across in (0.0, 0.5))
         return np.asarray((whole - still + alternating) / cols)
 
-    @cached_property
-    def _covariances_e2(self) -> FloatArray:
-        own = fft.irfft(_averaged(GRID, self._shape), GRID)[: GRID // 2]
-        apart = np.zeros(len(own))
-        apart[::2] = own[: len(own) // 2]
-        return np.asarray(self.noise_e**2 * own + self.alternating_e**2 * apart)
-
     def covariance_e2(self, apart_px: NDArray[np.int_]) -> FloatArray:
         """Covariance of two pixels that are read as many pixels apart, up to half of `GRID`."""
-        return np.asarray(self._covariances_e2[np.abs(apart_px)])
+        return self._mixed(_covariances(self._shape)[:, np.abs(apart_px)])
 
     def departures_e2(self, shape: tuple[int, int], period: int, phase: int, down: int, right: int) -> float:
         """Covariance of a pixel of a column of `phase` in the mosaic's `period` with the one `down` and `right` of it,
-        after the means of rows and columns were taken out of each plane of the mosaic.
-
-        What two rows' means have in common is the mean over pairs of their columns of both phases; on average over the
-        columns, a pixel has as much of the other's mean.
-        """
-        cols = shape[1]
-        first, second = (np.arange(cols) % period == (phase + more) % period for more in (0, right))
-        pairs = np.rint(np.correlate(second.astype(float), first.astype(float), mode="full"))
-        common = pairs @ self.covariance_e2(down * cols + np.arange(1 - cols, cols)) / pairs.sum()
-        apart = down * cols + right
-        own = float(self.covariance_e2(np.array(apart))) if abs(apart) < GRID // 2 else 0.0
-        return own - float(common) - self._column_means_e2(shape, period, down, right)
+        after the means of rows and columns were taken out of each plane of the mosaic."""
+        return float(self._mixed(_departures(self._shape, shape, period, phase, down, right)))
 
     def departures_apart_e2(self, shape: tuple[int, int], period: int, apart: int, turned: bool) -> float:
         """Mean covariance of pixels in one row that are `apart` columns apart, or, `turned`, as far from a border on
         either side, 1 to `apart` columns; after the means of rows and columns were taken out of each plane."""
-        if not turned:
-            each = [self.departures_e2(shape, period, phase, 0, apart) for phase in range(period)]
-            return float(np.mean(each))
-        right = 2 * np.arange(apart) + 1
-        lost = np.mean([self._column_means_e2(shape, period, 0, int(one)) for one in right[:: max(apart // 64, 1)]])
-        nearest = self.departures_e2(shape, period, 0, 0, 1) + self._column_means_e2(shape, period, 0, 1)
-        common = float(self.covariance_e2(np.array(1))) - nearest  # of rows' means in all columns an odd number apart
-        return float(np.mean(self.covariance_e2(right)) - common - lost)
+        return float(self._mixed(_departures_apart(self._shape, shape, period, apart, turned)))
 
-    def _column_means_e2(self, shape: tuple[int, int], period: int, down: int, right: int) -> float:
-        """Covariance of the means of columns, without those of the rows, that two pixels lose: of means over all rows,
-        and, in a mosaic, of what rows of both phases differ by."""
-        rows, cols = shape
-        k = np.arange(cols)
-        use = (k * period) % cols != 0
-        turn = np.cos(2.0 * np.pi * k * right / cols)[use]
-        found = float(np.sum(self._shown(k / cols, shape)[use] * turn))
-        if period == 2:  # half a cycle a row lies between two waves
-            between = 0.5 * (self.spectrum_e2((k + 0.5) / cols) + self.spectrum_e2((k - 0.5) / cols))
-            found += (-1.0) ** down * float(np.sum(between[use] * turn))
-        return found / (rows * cols)
+
+# Responses (2, ...) to the common and to the alternating noise of 1 e. A fit moves both sizes much more often than the
+# law, so they are kept by law.
+
+
+def _spectrum(law: PowerLaw, frequency_cy_per_px: FloatArray) -> FloatArray:
+    f = _from_whole(frequency_cy_per_px)
+    return np.stack([law.power(away) for away in (f, _from_whole(2.0 * f))])
+
+
+def _shown(law: PowerLaw, waves_cy_per_px: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """The spectrum as frames show it, which end: near a pole, with what leaks down the rows."""
+    rows, cols = shape
+    f = _from_whole(waves_cy_per_px)
+    found = []
+    for away, across in ((f, cols), (_from_whole(2.0 * f), cols // 2)):
+        near = _leaking((rows, across), law)
+        cycles = away * across * rows  # a frame, or its even or odd columns
+        smooth = law.power(np.maximum(cycles, 0.5) / (rows * across))
+        found.append(np.where(cycles < 0.5 * rows, np.interp(cycles, np.arange(len(near)), near), smooth))
+    return np.stack(found)
+
+
+@lru_cache(maxsize=256)
+def _plane(law: PowerLaw, frame: tuple[int, int], across: bytes, down: bytes, shape: tuple[int, ...]) -> FloatArray:
+    cols = frame[1]
+    size = int(np.prod(shape))
+    make = _kept_row_waves if size * cols <= KEPT_WAVES else _row_waves
+    waves, kernel = make(across, down, shape, cols)
+    return np.asarray(np.sum(kernel * _shown(law, waves, frame), axis=-1))
+
+
+@lru_cache(maxsize=256)
+def _along_rows(law: PowerLaw, cols: int, across: bytes) -> FloatArray:
+    lag = np.arange(1, cols)
+    covariances = _covariances(law)[:, :cols]
+    pairs = 2.0 * (1.0 - lag / cols) * covariances[:, 1:]
+    turn = np.cos(2.0 * np.pi * lag[:, None] * np.frombuffer(across))
+    return np.asarray(covariances[:, :1] + pairs @ turn)
+
+
+@lru_cache(maxsize=64)
+def _down_rows(law: PowerLaw, shape: tuple[int, int], down: bytes) -> FloatArray:
+    """Sum over all waves across the columns, at frequencies down the rows (doubles)."""
+    cols = shape[1]
+    waves = (np.frombuffer(down)[:, None] + np.arange(cols)) / cols
+    return np.asarray(_shown(law, waves, shape).sum(axis=-1))
+
+
+@lru_cache(maxsize=16)
+def _covariances(law: PowerLaw) -> FloatArray:
+    own = fft.irfft(_averaged(GRID, law), GRID)[: GRID // 2]
+    apart = np.zeros(len(own))
+    apart[::2] = own[: len(own) // 2]
+    return np.stack([own, apart])
+
+
+@lru_cache(maxsize=1024)
+def _departures(law: PowerLaw, shape: tuple[int, int], period: int, phase: int, down: int, right: int) -> FloatArray:
+    """Response of `OrderedNoise.departures_e2`. What two rows' means have in common is the mean over pairs of their
+    columns of both phases; on average over the columns, a pixel has as much of the other's mean."""
+    cols = shape[1]
+    first, second = (np.arange(cols) % period == (phase + more) % period for more in (0, right))
+    pairs = np.rint(np.correlate(second.astype(float), first.astype(float), mode="full"))
+    covariances = _covariances(law)
+    common = covariances[:, np.abs(down * cols + np.arange(1 - cols, cols))] @ pairs / pairs.sum()
+    apart = abs(down * cols + right)
+    own = covariances[:, apart] if apart < GRID // 2 else np.zeros(2)
+    return np.asarray(own - common - _column_means(law, shape, period, down, right))
+
+
+@lru_cache(maxsize=64)
+def _departures_apart(law: PowerLaw, shape: tuple[int, int], period: int, apart: int, turned: bool) -> FloatArray:
+    if not turned:
+        return np.asarray(
+            np.mean([_departures(law, shape, period, phase, 0, apart) for phase in range(period)], axis=0)
+        )
+    right = 2 * np.arange(apart) + 1
+    lost = np.mean([_column_means(law, shape, period, 0, int(one)) for one in right[:: max(apart // 64, 1)]], axis=0)
+    covariances = _covariances(law)
+    nearest = _departures(law, shape, period, 0, 0, 1) + _column_means(law, shape, period, 0, 1)
+    common = covariances[:, 1] - nearest  # of rows' means in all columns an odd number apart
+    return np.asarray(covariances[:, right].mean(axis=1) - common - lost)
+
+
+@lru_cache(maxsize=64)
+def _across_rows(law: PowerLaw, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Powers (2, cols) of the waves of 0 to cols - 1 cycles a row as frames show them, and of those half a cycle a row
+    between them."""
+    cols = shape[1]
+    k = np.arange(cols)
+    between = 0.5 * (_spectrum(law, (k + 0.5) / cols) + _spectrum(law, (k - 0.5) / cols))
+    return _shown(law, k / cols, shape), between
+
+
+@lru_cache(maxsize=1024)
+def _column_means(law: PowerLaw, shape: tuple[int, int], period: int, down: int, right: int) -> FloatArray:
+    """Covariance of the means of columns, without those of the rows, that two pixels lose: of means over all rows, and,
+    in a mosaic, of what rows of both phases differ by."""
+    rows, cols = shape
+    k = np.arange(cols)
+    use = (k * period) % cols != 0
+    turn = np.cos(2.0 * np.pi * k * right / cols) * use
+    shown, between = _across_rows(law, shape)
+    found = shown @ turn
+    if period == 2:  # half a cycle a row lies between two waves
+        found = found + (-1.0) ** down * (between @ turn)
+    return np.asarray(found / (rows * cols))
 
 
 def _from_whole(cycles: FloatArray) -> FloatArray:

@@ -61,8 +61,7 @@ def test_what_a_path_names_and_is_not_there_is_404_in_a_plain_sentence(shared: R
             if not path.startswith("/api/") or "{" not in path:
                 continue
             there = re.sub(r"\{\w+\}", unknown, path.replace("{form}", "zip"))
-            kind = "score" if "challenge" in path else "fit"
-            body = {"kind": kind} if path.endswith("/jobs") else {} if "requestBody" in described else None
+            body = {"kind": "fit"} if path.endswith("/jobs") else {} if "requestBody" in described else None
             body = {"station": "fakes"} if path.endswith("/request") and body is not None else body
             body = {"target": "cap"} if path.endswith("/confirm") else body
             response = client.request(method, there, json=body)

@@ -5,21 +5,24 @@ from __future__ import annotations
 import ast
 import json
 import re
+import socket
 import subprocess
 import sys
 import tomllib
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import api.client
 import lab.fit
-from api.client import ServiceClient, ServiceProblem
+from api.client import OtherVersion, ServiceClient, ServiceProblem, ServiceUnreachable, connect
 from api.pytest_plugin import FitReference
-from api.schemas import SessionStart, StoredSession
+from api.schemas import Health, SessionStart, StoredSession
 from lab.capture.session import Progress
+from lab.errors import InputError
 from lab.formats.results import FitResult
 from tests.api.conftest import Running
 from tests.lab.calibration.test_life import fitted, limits
@@ -103,6 +106,91 @@ def test_the_client_has_a_method_for_every_operation() -> None:
     assert wanted - asked_by_the_client() == OF_THE_PAGE
 
 
+def types_of_the_client() -> dict[tuple[str, str], str]:
+    """(method, path) -> name of the class that the client reads the answer as."""
+    found = {}
+    for call in ast.walk(ast.parse(Path(api.client.__file__).read_text())):
+        if not isinstance(call, ast.Call):
+            continue
+        called = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+        if called not in ("_get", "_pages", "_post", "_send", "_read", "_read_list") or len(call.args) < 2:
+            continue
+        model, asked = call.args[:2]
+        if not isinstance(model, ast.Name) or model.id == "model":
+            continue
+        method = ASKS.get(called, "GET")
+        inside = [one for one in ast.walk(asked) if isinstance(one, ast.Constant | ast.JoinedStr)]
+        texts = [ast.unparse(one).strip("f'\"") for one in inside]
+        if called in ("_read", "_read_list"):
+            method = next((one for one in texts if one in ("PUT", "POST", "PATCH", "DELETE")), method)
+        if paths := [one for one in texts if "/" in one]:
+            found[method, re.sub(r"{.*?}", "{}", paths[0].replace("{self.url}", ""))] = model.id
+    return found
+
+
+def name_of(schema: dict[str, Any]) -> str | None:
+    """Class of a described answer, or of the items of a list; None for what has none, or several."""
+    schema = schema.get("items", schema)
+    return schema["$ref"].rpartition("/")[2].removesuffix("-Output") if "$ref" in schema else None
+
+
+def test_the_clients_types_are_those_of_the_openapi_document() -> None:
+    described = json.loads((ROOT / "docs" / "reference" / "openapi.json").read_text())["paths"]
+    types, compared = types_of_the_client(), 0
+    for path, methods in described.items():
+        for method, operation in methods.items():
+            key = (method.upper(), re.sub(r"{.*?}", "{}", path.removeprefix("/api/v1")))
+            for status, response in operation["responses"].items():
+                schema = response.get("content", {}).get("application/json", {}).get("schema")
+                if status.startswith("2") and schema is not None and name_of(schema) and key in types:
+                    assert types[key] == name_of(schema), key
+                    compared += 1
+    assert compared > 0.8 * len(types) > 40  # the others are events, and results whose path serves several kinds
+
+
+def test_an_answer_of_another_version_is_one_line(shared: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    with ServiceClient(shared.url, shared.keys["read"]) as client:
+        monkeypatch.setattr(api.client, "Me", Health)
+        with pytest.raises(OtherVersion, match=r"200: the answer isn't of this version \(Health\.\w+: .*\); install"):
+            client.me()
+
+
+def test_a_service_that_isnt_there_is_one_line_with_a_remedy() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    with pytest.raises(ServiceUnreachable, match=rf"http://127.0.0.1:{port}/: .*refused; start `calibench serve`"):
+        connect(f"http://127.0.0.1:{port}", "calibench_none")
+
+
+def test_connecting_needs_a_key_that_the_service_takes(shared: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CALIBENCH_KEY", raising=False)
+    with pytest.raises(InputError, match="no key"):
+        connect(shared.url)
+    with pytest.raises(ServiceProblem, match="401: no valid key"):
+        connect(shared.url, "calibench_wrong")
+    monkeypatch.setenv("CALIBENCH_KEY", shared.keys["read"])
+    with connect(f"{shared.url}/") as client:
+        assert client.me().scope == "read"
+
+
+def test_a_bar_shows_how_far_a_session_is(running: Running, capsys: pytest.CaptureFixture[str]) -> None:
+    with ServiceClient(running.url, running.keys["admin"], progress=True) as client:
+        assert client.capture("fakes", quick=True, sequences=("dark",)).state == "finished"
+    assert re.search(r"session \w+ +\d+%", capsys.readouterr().err)
+
+
+def test_recordings_are_sent_from_memory_and_worked_on(
+    running: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lab.fit, "fit_recording_set", lambda *_: fitted(2.0))
+    with ServiceClient(running.url, running.keys["admin"]) as client:
+        session = client.capture("fakes", quick=True, sequences=("dark",))
+        recordings = running.store.recording_set(session.id)
+        sent = client.send_recordings(recordings)
+        assert sent.id != session.id and len(list(client.recorded_captures(sent.id))) == len(recordings.captures())
+        assert client.fit(sent) == client.fit(session) == client.fit(session.id) == fitted(2.0)
+
+
 def test_a_run_and_a_job_are_followed_to_their_end(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lab.fit, "fit_recording_set", lambda *_: fitted(2.0))
     with ServiceClient(running.url, running.keys["admin"]) as client:
@@ -149,7 +237,7 @@ def test_the_installed_plugin_is_this_one_and_loads_nothing_heavy() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["entry-points"]["pytest11"] == {"calibench": "api.pytest_plugin"}
     needed = {line.split(">")[0] for line in project["optional-dependencies"]["test"]}
-    assert needed == {"pytest", "httpx"}
+    assert needed == {"pytest"}  # httpx came with the client
     code = "import sys, api.pytest_plugin; print(sorted({'numpy', 'httpx', 'fastapi', 'pydantic'} & set(sys.modules)))"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert loaded.stdout.strip() == "[]"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,14 +20,6 @@ DESCRIPTION = Path(__file__).parents[2] / "docs" / "reference" / "openapi.json"
 def as_sent(context: object, value: object) -> bytes:
     """A body that is bytes already."""
     return value if isinstance(value, bytes) else str(value).encode()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def nothing_is_drawn() -> Iterator[None]:
-    """A challenge that is asked for costs minutes of every core."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("lab.jobs.carry_out", lambda *_: None)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import base64
 import re
+import shutil
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, cast
@@ -77,7 +79,6 @@ VIEWS = {
     "/stations/fakes": "#devices tr:nth-child(5)",
     "/jobs": "#no-jobs",
     "/models": "#models tr",
-    "/challenges": "#no-challenges",
     "/nothing": "#view-none a",
 }
 
@@ -93,11 +94,20 @@ def browser() -> Iterator[Any]:
         started.close()
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """A data folder to copy, and the keys that it knows."""
+
+    root: Path
+    keys: dict[str, str]
+
+
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """A service with three finished sessions that were fitted, the last one drifted and diagnosed; a session that is
-    held; a recording set."""
-    with serving(tmp_path_factory.mktemp("data")) as running, running.client() as client:
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+    """Three finished sessions that were fitted, the last one drifted and diagnosed; a session that is held; a recording
+    set."""
+    root = tmp_path_factory.mktemp("prepared") / "data"
+    with serving(root) as running, running.client() as client:
         (running.store.root / "limits.toml").write_text(LIMITS)
         asked = {"station": "fakes", "quick": True, "sequences": ["dark", "flat"], "name": "nightly"}
         waits = client.post(
@@ -113,6 +123,13 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         with ServiceClient(running.url, running.keys["admin"]) as sender:
             archive = sender.fetch_session(started["id"], running.store.root / "nightly.zip")
             sender.send_recordings(archive)
+        return Prepared(running.store.root, running.keys)
+
+
+@pytest.fixture
+def lab(prepared: Prepared, tmp_path: Path) -> Iterator[Running]:
+    """A service on a copy of the prepared folder, so that no test finds what another left."""
+    with serving(shutil.copytree(prepared.root, tmp_path / "lab"), keys=prepared.keys) as running:
         yield running
 
 
@@ -210,7 +227,7 @@ class Watched:
         assert [line for line in self.complaints if "401" not in line] == []
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def ids(lab: Running) -> dict[str, str]:
     """Ids of the diagnosed session and of a frame of it, of the recording set, and of the newest calibration."""
     with lab.client() as client:
@@ -287,7 +304,7 @@ def test_a_session_by_keyboard_alone(browser: Any, lab: Running) -> None:
     watched.press("Enter", "#then[open] select[name=then]")
     watched.tab_to("then")
     watched.press("Home", "#then-words:text-is('Then: nothing')")  # a pipeline's fit would be newer than the test's
-    lab.bench.delay_s = 0.05
+    lab.bench.delay_s = 0.2
     watched.tab_to("Start a session")
     watched.press("Enter", ".station.busy a:has-text('by keyboard')")
     watched.tab_to("Pause")
@@ -396,7 +413,7 @@ def test_two_stations_a_queue_and_a_halt(browser: Any, lab: Running) -> None:
     watched.log_in(lab)
     page.wait_for_selector(".station:nth-child(2)")
     page.wait_for_selector("#strip li:nth-child(2)")
-    lab.bench.delay_s = 0.05
+    lab.bench.delay_s = 0.2
     page.fill("#start-form input[name=name]", "watched")
     page.click("#start")
     page.wait_for_selector(".station.busy progress")
@@ -419,7 +436,6 @@ def test_two_stations_a_queue_and_a_halt(browser: Any, lab: Running) -> None:
     lab.bench.delay_s = 0.0
     assert not lab.bench.opened
     watched.go("/", "#queue .reason:has-text('halted by the key')")
-    (lab.store.root / "stations" / "other.toml").unlink()
     watched.close()
 
 
@@ -709,7 +725,7 @@ def test_the_steps_of_an_analysis_are_followed_to_its_report(
     watched.log_in(lab)
     page.fill("#start-form input[name=name]", "followed")
     page.evaluate("""() => { document.querySelector("#start-form select[name=then]").value = "pipeline" }""")
-    lab.bench.delay_s = 0.05
+    lab.bench.delay_s = 0.5  # until its steps were looked at
     page.click("#start")
     page.wait_for_selector(".station.busy a:has-text('followed')")
     watched.go("/sessions", "#sessions a:text-is('followed')")
@@ -811,27 +827,6 @@ def test_what_waits_is_edited_and_copied_with_what_follows(browser: Any, lab: Ru
     for name in ("for the next night", "once more"):
         page.click(f"#queue tr:has-text('{name}') button:has-text('Remove')")
         page.wait_for_selector(f"#queue tr:has-text('{name}')", state="detached")
-    watched.close()
-
-
-def test_a_challenge_is_made_and_deleted(browser: Any, lab: Running, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The drawing itself is a stand-in that ends at once, with no case made."""
-    monkeypatch.setattr("lab.jobs.carry_out", lambda *_: None)
-    watched = Watched(browser, lab)
-    watched.log_in(lab, "calibrate")
-    page = watched.page
-    watched.go("/challenges", "#challenge-form:not([hidden])")
-    page.fill("#challenge-form input[name=name]", "since the upgrade")
-    page.fill("#challenge-form input[name=cases]", "2")
-    page.press("#challenge-form input[name=cases]", "Enter")
-    page.wait_for_selector("#challenges tr:has-text('since the upgrade'):has-text('0/2')")
-    page.wait_for_selector("#challenges .state:has-text('unfinished')")
-    watched.go("/jobs", "#jobs tr:has-text('make challenge'):has-text('since the upgrade') .state.done")
-    watched.go("/challenges", "#challenges button:has-text('Delete'):not([disabled])")
-    assert watched.faults() == []
-    page.on("dialog", lambda asked: asked.accept())
-    page.click("#challenges button:has-text('Delete'):not([disabled])")
-    page.wait_for_selector("#challenges tr", state="detached")
     watched.close()
 
 
@@ -1081,7 +1076,6 @@ def test_what_was_chosen_stays_chosen(browser: Any, lab: Running) -> None:
     page.click("#halt")
     page.wait_for_selector("#halt-told:has-text('shutter closed')")
     lab.bench.delay_s = 0.0
-    (lab.store.root / "stations" / "another.toml").unlink()
     watched.close()
 
 

@@ -171,11 +171,6 @@ def test_notes_may_have_several_lines(shared: Running) -> None:
             "then.webhook: 'lab' isn't the URL of a web server; give one, such as https://",
         ),
         (
-            "challenges",
-            {"json": {"cases": 0}},
-            "cases: 0 should be greater than or equal to 1; give a whole number, such as",
-        ),
-        (
             "predictions",
             {"json": {"camera_model": "0123456789abcdef", "plan": 3}},
             "plan: 3 isn't taken; give an object",

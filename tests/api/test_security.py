@@ -105,16 +105,8 @@ ROUTES = [
     ("POST", "/predictions/{prediction_id}/score", "read"),
     ("GET", "/comparisons", "read"),
     ("GET", "/comparisons/page", "read"),
-    ("GET", "/challenges", "read"),
-    ("POST", "/challenges", "calibrate"),
-    ("GET", "/challenges/{challenge_id}", "read"),
-    ("DELETE", "/challenges/{challenge_id}", "calibrate"),
-    ("POST", "/challenges/{challenge_id}/jobs", "calibrate"),
-    ("GET", "/challenges/{challenge_id}/cases/{case}/archive.{form}", "read"),
-    ("GET", "/challenges/{challenge_id}/score", "read"),
-    ("GET", "/challenges/{challenge_id}/truths", "read"),
 ]
-#: What can't be used as it is sent here: an empty upload, a query without its parameters, a challenge of no case.
+#: What can't be used as it is sent here: an empty upload, a query without its parameters.
 UNUSABLE = {
     ("POST", "/recordings"),
     ("POST", "/camera-models"),
@@ -122,7 +114,6 @@ UNUSABLE = {
     ("GET", "/drift"),
     ("GET", "/comparisons"),
     ("GET", "/comparisons/page"),
-    ("POST", "/challenges"),
     ("GET", "/camera-models/{model_id}/budget"),
 }
 BODIES: dict[str, Any] = {
@@ -139,8 +130,6 @@ BODIES: dict[str, Any] = {
     "/stations/{name}/estimate": {},
     "/predictions": {"camera_model": "0" * 16, "plan": {"recordings_id": "0" * 16}},
     "/predictions/{prediction_id}/score": {"recordings_id": "0" * 16},
-    "/challenges": {"cases": 0},
-    "/challenges/{challenge_id}/jobs": {"kind": "score"},
 }
 
 
@@ -165,9 +154,7 @@ def test_each_route_needs_a_key_of_its_scope(shared: Running, method: str, path:
         "device": "stage",
         "sequence": "nothing",
         "model_id": "0" * 16,
-        "challenge_id": "0" * 16,
         "prediction_id": "0" * 16,
-        "case": "case-0001",
         "form": "tar",
         "picture": "png",
     }

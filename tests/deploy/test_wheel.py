@@ -16,7 +16,7 @@ import pytest
 pytestmark = pytest.mark.extra  # builds and installs the wheel
 
 CHECKOUT = Path(__file__).parents[2]
-PACKAGES = ("api", "drivers", "lab", "mocks", "sim")
+PACKAGES = ("api", "calibench", "drivers", "lab", "mocks", "sim")
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,8 @@ def test_it_runs_away_from_the_checkout(wheel: Path, tmp_path: Path) -> None:
     paths = [str(tmp_path / "installed"), sysconfig.get_path("purelib")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     command = [sys.executable, "-m", "lab.cli", "capture", "--quick", "--only", "dark", "--out", "data"]
-    where = [sys.executable, "-c", "import api, drivers, lab, mocks, sim; print(lab.__file__, sim.__file__)"]
+    code = "import calibench, api, drivers, lab, mocks, sim; print(calibench.__file__, lab.__file__, sim.__file__)"
+    where = [sys.executable, "-c", code]
     found = subprocess.run(where, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
     assert all(one.startswith(str(tmp_path)) for one in found.split()), found
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)

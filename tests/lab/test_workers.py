@@ -4,29 +4,26 @@ results."""
 from __future__ import annotations
 
 import math
-import multiprocessing
 import operator
 import os
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from distributed import LocalCluster
 
-from lab.challenge.draw import recordings_of
-from lab.challenge.make import make
-from lab.challenge.run import run_all
-from lab.challenge.truth import FIRST_FRESH_SEED
-from lab.cli import main
+from evaluation.__main__ import main
+from evaluation.blind import BlindProof
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
+from evaluation.make import make
+from evaluation.truth import FIRST_FRESH_SEED
 from lab.diagnose.inference.bootstrap import healthy_draws
 from lab.diagnose.inference.side_model import measurement_model
-from lab.errors import Cancelled, InputError
+from lab.errors import InputError
 from lab.formats import recording_set
 from lab.workers import Workers
-from mocks.former import ConcealedCamera, Plan
 from sim.optics.traced_table import TableSettings, lens_table
 from sim.optics.zmx import read_zmx
 
@@ -73,27 +70,28 @@ def test_a_scheduler_without_workers_is_said() -> None:
 
 
 @pytest.mark.slow
-def test_a_challenge_is_made_and_diagnosed_on_the_cluster(
+def test_sealed_cases_are_made_and_diagnosed_on_the_cluster(
     cluster: Workers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The same recordings as in this process, to the byte; and what a worker says of a set that can't be read."""
     seed, address = FIRST_FRESH_SEED + 5, str(cluster.scheduler)
     monkeypatch.chdir(tmp_path)
     words = ["--cases", "1", "--seed", str(seed), "--size", "small", "--cfa", "MONO"]
-    assert main(["challenge", "make", "--out", "there", "--scheduler", address, *words]) == 0
+    assert main(["make", "--out", "there", "--scheduler", address, *words]) == 0
     assert "1 cases" in capsys.readouterr().out
     here = make(tmp_path / "here", 1, seed, tmp_path / "here.json", "small", Workers(), cfa="MONO")
     there = make(tmp_path / "there", 1, seed, tmp_path / "there.truths.json", "small", Workers(), cfa="MONO")
     assert there.truths["case-0001"].truth == here.truths["case-0001"].truth
     (tmp_path / "there" / "case-0002").mkdir()
-    runs = run_all(Path("there"), ("case-0002",), cluster)
+    runs = BlindProof(Path("there"), ("case-0002",)).run(Path("there"), workers=cluster)
     assert "manifest.json" in str(runs["case-0002"].error)
 
 
 def test_what_a_worker_says_of_a_set_that_is_not_there(cluster: Workers, tmp_path: Path) -> None:
     """A diagnosis on the cluster that fails is this case's result, as one here is."""
     there, here = (
-        run_all(tmp_path / str(k), ("case-0001",), workers) for k, workers in enumerate((cluster, Workers()))
+        BlindProof(tmp_path / str(k), ("case-0001",)).run(tmp_path / str(k), workers=workers)
+        for k, workers in enumerate((cluster, Workers()))
     )
     for runs in (there, here):
         assert "no such folder" in str(runs["case-0001"].error)
@@ -124,12 +122,3 @@ def test_drawn_healthy_cameras_are_the_same(cluster: Workers, tmp_path: Path, mo
     assert len(here) == 3
     assert len({draw.top_score for draw in here}) == 3
     assert there == here
-
-
-def test_what_a_tick_raises_ends_the_processes() -> None:
-    """Somebody cancels while a process works: nobody waits for it."""
-    before = set(multiprocessing.active_children())
-    work = Workers(jobs=1, apart=True, tick=Mock(side_effect=Cancelled))
-    with pytest.raises(Cancelled):
-        list(work.done(time.sleep, [600.0]))
-    assert set(multiprocessing.active_children()) <= before

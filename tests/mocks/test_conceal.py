@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typer.testing import CliRunner
 
-from lab.challenge.live import typical_spec
+from evaluation.live import typical_spec
 from mocks.bench import MARGIN_PX, OVERSAMPLE, SCREEN_OVERSAMPLE, Bench
 from mocks.command import commands
 from mocks.conceal import NOT_SHOWN, OF_THE_RADIOMETER, SIDES, ConcealError, _made, parse
@@ -135,6 +135,10 @@ CASES = (
     Case("both:stray_light:share_percent=10", (RED, SWEPT)),
     Case("left:taps:gain_percent=8,quarter_offset_e=6", (FLAT, DARK)),
     Case("left:trefoil:w333_x_um=0.4", (EDGE, SCREEN)),
+    Case("left:turbulent_air:width_um=2.5", (EDGE, SCREEN)),
+    Case("left:secondary_astigmatism:cos_um=0.4", (EDGE, SCREEN)),
+    Case("left:secondary_coma:cos_um=0.4", (EDGE, SCREEN)),
+    Case("left:tetrafoil:cos_um=0.5", (EDGE, SCREEN)),
     Case("left:veiling_glare:share_percent=20,halo_share=0.5", (EDGE, BOARD)),
     Case("both:vibration_blur:amplitude_x_um=3", (EDGE, SCREEN)),
     Case("left:vignetting:corner_loss_percent=30", (FLAT, SCREEN)),

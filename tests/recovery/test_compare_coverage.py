@@ -15,11 +15,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recording_set
+from evaluation.draw import recording_set
+from evaluation.independent_simulator import ConcealedCamera, DrawnSession, Law, Plan, record
 from lab.fit import fit_recording_set
 from lab.fit.compare import FALSE_ALARM_RATE, compare
 from lab.formats.results import FitResult
-from mocks.former import ConcealedCamera, DrawnSession, Law, Plan, record
 
 SESSIONS = 15
 SEED = 3

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
 from lab.diagnose.inference.bootstrap import healthy_draws
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.side_model import measurement_model
-from mocks.former import ConcealedCamera, Plan
 from sim.effects.library import candidates
 
 DRAWS = 24

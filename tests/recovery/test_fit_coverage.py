@@ -12,7 +12,8 @@ from lab.fit.noise.noise_fit import noise_fit
 from lab.fit.spectral import estimate_sensitivity
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import NoiseFit
-from lab.observables.noise.levels import MeasuredLevel, level_statistics
+from lab.observables.noise.levels import MeasuredLevel
+from lab.observables.noise.stack import level_statistics
 from sim.camera import CameraModel, Lens
 from sim.sensor.electrons import FixedPattern, sample_from
 from sim.spectrum import Spectrum

@@ -16,7 +16,8 @@ from lab.fit.noise.noise_fit import noise_fit
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import NoiseFit
 from lab.observables.darks.pixels import DarkPixels
-from lab.observables.noise.levels import MeasuredLevel, Stack
+from lab.observables.noise.levels import MeasuredLevel
+from lab.observables.noise.stack import Stack
 from lab.observables.weighted_lines import linearity
 from sim.sensor.mosaic import planes
 
@@ -114,7 +115,9 @@ class Drawn:
             for t in truth.flats
         ]
         rows, cols = truth.shape
-        return noise_fit(darks, flats, DataSheet(rows=rows, cols=cols, cfa=truth.cfa, bit_depth=12), pixels=pixels)
+        return noise_fit(
+            darks, flats, DataSheet(rows=rows, cols=cols, cfa=truth.cfa, bit_depth=12), pixels=pixels.figures()
+        )
 
 
 def quadratic_sum(parts: tuple[float, ...]) -> float:

@@ -16,8 +16,8 @@ from lab.errors import NotDetermined
 from lab.observables.darks.frames import DarkCondition, conditions, usual_conditions
 from lab.observables.darks.readout import MOST_FRAMES, dark_readout
 from lab.observables.dataset import Dataset, held_out_flats, held_out_of
-from lab.observables.flats.field import LEAST_SIGNAL, dark_level_dn, flats
-from lab.observables.noise.figures import CLIP, robust_std
+from lab.observables.flats.images import LEAST_SIGNAL, dark_level_dn, flats
+from lab.observables.noise.robust import CLIP, robust_std
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 

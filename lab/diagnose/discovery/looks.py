@@ -18,7 +18,7 @@ from lab.observables.codes.density import CodeHistogram, counted, counted_in_all
 from lab.observables.darks.frames import cell_means
 from lab.observables.darks.readout import dark_readout
 from lab.observables.dataset import Dataset
-from lab.observables.flats.field import FlatLevel, flats, without_dark
+from lab.observables.flats.images import FlatLevel, flats, without_dark
 from lab.observables.reads import CODES, COLLECTED, GAINS, acting
 from sim.camera import Cfa
 from sim.effects.base import Effects

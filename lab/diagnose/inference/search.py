@@ -121,10 +121,10 @@ class Search:
     # --- search ------------------------------------------------------------------------------------------------------
 
     def best(self, report: Callable[[str], None] = lambda _: None) -> Fit:
-        """From no effect on: the likeliest of the sets with one effect more, one exchanged or one less, until the log
-        odds don't rise; then of the sets with one effect exchanged for two, or two or three more that by themselves
-        aren't seen. Of each kind the best in closed form are refitted, about the current set, or about it without the
-        member that is exchanged."""
+        """From no effect on: the likeliest of the sets with one effect more, one exchanged or one less, and of those
+        with one more beside the runner-up, until the log odds don't rise; then of the sets with one effect exchanged
+        for two, or two or three more that by themselves aren't seen. Of each kind the best in closed form are refitted,
+        about the current set, or about it without the member that is exchanged."""
         current = self.fitted((), converged=True)
         for step in range(self.policy.search_steps):
             report(f"looking for {'another' if step else 'an'} effect")
@@ -190,6 +190,8 @@ class Search:
             (self._wide_extensions, self._wide_exchanges) if wide else (self._extensions, self._exchanges)
         )
         kinds = [extended(current), *(exchanged(current, i) for i in range(len(current.effects)))]
+        if not wide:
+            kinds.append(self._extensions_of_runner_up(current))
         found: dict[frozenset[str], _Proposal] = {}
         for one in chain.from_iterable(zip_longest(*kinds)):
             if one is not None and one.key not in self.fits:
@@ -202,6 +204,18 @@ class Search:
         seen = self._seen_sets(current, 1)
         least = self.policy.promised_share * seen[0].score if seen else 0.0
         return [self._proposal(current, one) for one in seen if one.score > least]
+
+    def _extensions_of_runner_up(self, current: Fit) -> list[_Proposal]:
+        """One effect more beside the likeliest of the sets that differ from the current one by one member: those that
+        promise more than the current set has. An effect that does the work of two is fitted before either of them, and
+        is left for both only from here."""
+        key = frozenset(current.names)
+        others = [f for f in self._listed() if len(f.effects) == len(key) and len(key - frozenset(f.names)) == 1]
+        if len(key) < 2 or not others:
+            return []
+        second = max(others, key=self.log_odds)
+        least = self.log_odds(current) - self.promised_log_odds(second)
+        return [self._proposal(second, one) for one in self._seen_sets(second, 1) if one.log_odds > least]
 
     def _wide_extensions(self, current: Fit) -> list[_Proposal]:
         """Two effects more, or three, where fewer aren't seen. What hides a pair is fitted first and exchanged for it

@@ -20,7 +20,8 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.outcome.expected_information import Forecast
 from lab.diagnose.outcome.settling_capture import FEW_REPEATS, MORE_REPEATS, repeats_of
 from lab.formats.recording_set import RecordingSet
-from lab.observables.noise.figures import BLACK_FLOOR_DN, LAMP_FLOOR
+from lab.observables.noise.figures import BLACK_FLOOR_DN
+from lab.observables.noise.repeatability import LAMP_FLOOR
 from lab.observables.spectra.curves import CURVE_ROUGH_STD
 from lab.observables.spectra.narrowband import NARROWBAND_FLOOR
 from sim.camera import CameraModel, Side

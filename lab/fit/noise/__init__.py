@@ -2,7 +2,8 @@
 
 Definitions: EMVA Standard 1288, release 4.0 (linear). The steps, one module each:
 
-- `lab.observables.noise.levels`: means, temporal and spatial variances of the repeats of one level, without defective
+- `lab.observables.noise.side_levels`: the darks and flats of one camera by level, which the diagnosis reads, too;
+  `lab.observables.noise.stack`: means, temporal and spatial variances of the repeats of one level, without defective
   pixels and the smooth shading; `lab.observables.flats.stated_light`: the light that flats state;
 - `lab.observables.flats.level_lines`: dark means against exposure, which flats clip, and a response that outliers
   don't move;

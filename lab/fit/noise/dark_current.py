@@ -109,7 +109,8 @@ def temperature_law(found: Sequence[tuple[float, float, float]], gain_error: flo
 
 def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
     """Read noise, e, and its standard deviation: sqrt(floor - s^2 / 12) / K with the step s of the codes, the floor a
-    weighted mean over the planes.
+    weighted mean over the planes. The floor is the darks' variance less the shot noise of their mean above black, so
+    that an error of the black level is one of K times it.
 
     None where darks have no repeats, or where rounding hides the noise.
     """
@@ -140,7 +141,8 @@ def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
     gradient[2:] = weight / (2.0 * noise * t.gain)
     widened = t.covariance.copy()
     widened[2:, 2:] *= chi2_factor(between, count - 1)
-    return noise / t.gain, float(np.sqrt(gradient @ widened @ gradient))
+    black = 0.5 * float(np.sqrt(e.dark.lines[None].covariance[0, 0])) / noise
+    return noise / t.gain, float(np.hypot(np.sqrt(gradient @ widened @ gradient), black))
 
 
 def black_level(e: Evaluation) -> tuple[float | None, float | None]:

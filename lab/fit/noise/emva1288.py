@@ -18,7 +18,9 @@ from scipy import special
 from lab.formats.results import Emva1288, Emva1288Points
 from lab.formats.results.words import measured
 from lab.observables.codes.rounding import QUANTISATION_DN2
-from lab.observables.noise.levels import BoolArray, MeasuredLevel, SpatialVariance
+from lab.observables.noise.frame_sums import BoolArray
+from lab.observables.noise.levels import MeasuredLevel
+from lab.observables.noise.stack import SpatialVariance
 from lab.observables.weighted_lines import DarkLine, chi2_factor, dark_line, linearity, root
 from sim.spectrum import FloatArray
 

@@ -501,9 +501,13 @@ class Evaluation:
     @cached_property
     def dark_drift_dn(self) -> float:
         """Standard deviation of the means of repeated dark frames about that of their level, DN."""
+        return self.dark_scatter_dn(self.levels.darks)
+
+    def dark_scatter_dn(self, darks: Sequence[MeasuredLevel]) -> float:
+        """Return the standard deviation of the means of repeated frames of `darks` about that of their level, DN."""
         rests = [
             np.array(level.plane[name].frame_means) - level.plane[name].mean
-            for level in self.levels.darks
+            for level in darks
             for name in self.levels.names
             if level.repeats > 1
         ]

@@ -4,9 +4,9 @@ its plots."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -51,10 +51,13 @@ from lab.formats.results import (
 from lab.formats.results.plausible import implausible_figures
 from lab.observables.acquisition_errors import alike_planes, copied_frames, exchanged_frames
 from lab.observables.codes.step import find_code_step, under_highest_code
-from lab.observables.darks.pixels import DarkPixels, read_noise_distribution, stack_of
+from lab.observables.darks.pixels import PixelFigures
 from lab.observables.flats.stated_light import StatedLight, lamps_of, light_of, most_frequent_gain_db, why_not
-from lab.observables.noise.levels import DEFECT_SIGMA, MeasuredLevel, PlaneStatistics, defective_pixels, rounded_c
+from lab.observables.noise.levels import MeasuredLevel
 from lab.observables.noise.repeats import find_drifts
+from lab.observables.noise.side_levels import dark_levels, flat_statistics, grouped
+from lab.observables.noise.stack import PlaneStatistics
+from lab.observables.noise.surface import DEFECT_SIGMA
 from lab.observables.weighted_lines import chi2_factor, root
 from sim.camera import Side
 
@@ -166,19 +169,19 @@ def noise_fit(
     camera: DataSheet,
     gain_db: float = 0.0,
     defects: int = 0,
-    pixels: DarkPixels | None = None,
+    pixels: PixelFigures | None = None,
 ) -> NoiseFit:
     """Return the noise fit on the statistics of levels; the method: `lab.fit.noise`.
 
     `defects`: number of pixels that were left out of all levels; `pixels`: single pixels in the darks. Raises
     `NotDetermined` where fewer than three unsaturated flat levels have repeats.
     """
-    if pixels is not None and pixels.bad is not None:
-        defects = int(np.count_nonzero(pixels.bad))
+    if pixels is not None:
+        defects = pixels.number or defects
     return _result(evaluate(darks, flats, camera, gain_db, defects, tuple(flats[0].plane)), pixels)
 
 
-def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
+def _result(e: Evaluation, pixels: PixelFigures | None) -> NoiseFit:
     """All figures. The order of the steps is that of the remarks."""
     t = e.transfer
     scale = 10.0 ** (-e.levels.gain_db / 20.0)
@@ -189,7 +192,7 @@ def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
     principal = principal_figures(e)
     figures: dict[str, Any] = principal | quantum_efficiency(e)
     from_variance, from_variance_std = dark_current_from_variance(e)
-    dark = pixels is not None and e.levels.darks
+    of_pixels = pixels.at_gain(t.gain) if pixels is not None and e.levels.darks else PixelFigures()
     return NoiseFit(
         **figures,
         conversion_gain_at_zero_dn_per_e=t.curve_gain * scale,
@@ -200,8 +203,8 @@ def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
         dark_current_from_variance_e_per_s_std=from_variance_std,
         dark_temperature_c=dark_temperature_c(e),
         dark_current_temperature=dark_current_temperature(e),
-        read_noise_distribution=read_noise_distribution(pixels, t.gain) if dark and pixels is not None else None,
-        defects=pixels.defects(t.gain) if dark and pixels is not None else None,
+        read_noise_distribution=of_pixels.noise,
+        defects=of_pixels.defects,
         inconsistent_levels=e.consistency.inconsistent,
         response_scatter_percent=100.0 * e.consistency.scatter,
         channels=channel_figures(e, principal),
@@ -357,7 +360,6 @@ def remark_on_planes(e: Evaluation) -> None:
 
 
 MIN_SIZE_PX = 16
-C = TypeVar("C", bound=Capture)
 
 
 def fit_noise(recordings: RecordingSet, side: Side, drifts: Sequence[RepeatDrift] | None = None) -> NoiseFit:
@@ -394,7 +396,7 @@ def fit_noise(recordings: RecordingSet, side: Side, drifts: Sequence[RepeatDrift
     code = find_code_step(recordings, side)
     recordings = under_highest_code(recordings, side, code)
     camera = recordings.camera(side)
-    dark_levels, pixels = _dark_levels(recordings, darks, camera, code.step_dn, drifts)
+    measured = dark_levels(recordings, darks, flats, code.step_dn).with_drifts(drifts)
     light = light_of(flats, camera)
     lamps = _lamps_of(recordings, flats, light)
     flat_levels = [
@@ -402,18 +404,18 @@ def fit_noise(recordings: RecordingSet, side: Side, drifts: Sequence[RepeatDrift
             group[0].exposure_s,
             light[group[0].id].amount,
             lamps[group[0].id],
-            stack_of(recordings, group, pixels.bad, code.step_dn).statistics(),
+            flat_statistics(recordings, group, measured, code.step_dn),
             group[0].temperature_c,
             tuple(flat.id for flat in group),
             light[group[0].id].std,
             light[group[0].id].calibration_std,
         )
-        for group in _grouped(flats, lambda flat: (flat.exposure_s, light[flat.id].amount, lamps[flat.id]))
+        for group in grouped(flats, lambda flat: (flat.exposure_s, light[flat.id].amount, lamps[flat.id]))
     ]
     alike = alike_planes(recordings, side)
     mishaps = (*other_gains, *copies.told, *(one.told(side) for one in (exchanged, alike) if one is not None))
     try:
-        fitted = noise_fit(dark_levels, flat_levels, camera, gain_db, pixels=pixels)
+        fitted = noise_fit(measured.levels, flat_levels, camera, gain_db, pixels=measured.pixels)
     except NotDetermined as refused:
         raise NotDetermined("noise", "; ".join((*mishaps, refused.reason))) from refused
     reason = why_not(flats, camera)
@@ -427,26 +429,13 @@ def _at_other_gains(captures: Sequence[Capture], gain_db: float) -> list[str]:
     if not others:
         return []
     listed = []
-    for group in _grouped(others, lambda capture: (capture.kind, capture.gain_db)):
+    for group in grouped(others, lambda capture: (capture.kind, capture.gain_db)):
         kind, gain = group[0].kind, group[0].gain_db
         stated = "without gain_db (taken as 0 dB)" if gain is None else f"at {gain:g} dB"
         ids = group[0].id if len(group) == 1 else f"{group[0].id} .. {group[-1].id}"
         listed.append(f"{len(group)} {kind}{'s' if len(group) > 1 else ''} {stated} ({ids})")
     what = ", ".join(listed)
     return [f"fitted at {gain_db:g} dB, the gain of most flats: {what} left out; fit them in a set of their own"]
-
-
-def _mean_c(captures: Sequence[Capture]) -> float | None:
-    """Mean of the temperatures that the captures state, deg C; None where none does."""
-    known = [capture.temperature_c for capture in captures if capture.temperature_c is not None]
-    return float(np.mean(known)) if known else None
-
-
-def _grouped(captures: Sequence[C], key: Callable[[C], Hashable]) -> list[list[C]]:
-    groups: dict[Hashable, list[C]] = {}
-    for capture in captures:
-        groups.setdefault(key(capture), []).append(capture)
-    return list(groups.values())
 
 
 def _lamps_of(
@@ -460,41 +449,6 @@ def _lamps_of(
         flat.id: (None if flat.id in measured or flat.radiance is None else names[flat.radiance], *light[flat.id].lamp)
         for flat in flats
     }
-
-
-def _dark_levels(
-    recordings: RecordingSet,
-    darks: Sequence[DarkCapture],
-    camera: DataSheet,
-    step_dn: float,
-    drifts: Sequence[RepeatDrift],
-) -> tuple[list[MeasuredLevel], DarkPixels]:
-    """Statistics of the darks, longest exposure first: it shows the hot pixels, which are left out from there on."""
-    pixels = DarkPixels(camera.cfa, step_dn)
-    levels = []
-    drift_of = {name: drift for drift in drifts for name in drift.changing}
-    groups = _grouped(darks, lambda dark: (dark.exposure_s, rounded_c(dark.temperature_c)))
-    for group in sorted(groups, key=lambda group: -group[0].exposure_s):
-        stack = stack_of(recordings, group, pixels.bad, step_dn)
-        if pixels.longest is None and stack.mean is not None:
-            bad = defective_pixels(stack.mean, camera.cfa, step_dn)
-            if bad.any():
-                pixels.bad = bad
-                stack = stack_of(recordings, group, bad, step_dn)
-        pixels.take(stack, group[0].exposure_s)
-        levels.append(
-            MeasuredLevel(
-                group[0].exposure_s,
-                0.0,
-                "dark",
-                stack.statistics(),
-                rounded_c(group[0].temperature_c),
-                tuple(dark.id for dark in group),
-                sensor_c=_mean_c(group),
-                drift=next((drift_of[dark.id] for dark in group if dark.id in drift_of), None),
-            )
-        )
-    return levels, pixels
 
 
 # --- The noise fit on a table of channel means and variances, for recordings whose frames aren't at hand --------------
@@ -578,6 +532,7 @@ def _level(row: TableRow, camera: DataSheet) -> tuple[Setting, PlaneStatistics]:
         clipped_share=1.0 if is_clipped else 0.0, piled_share=0.0, zero_share=0.0, highest=mean, shape=(side, side),
         mean_of_all=mean,
         temporal_variance_of_all=variance,
+        mean_frame_variance=variance / repeats,
     )  # fmt: skip
     setting = (
         kind,

@@ -15,7 +15,11 @@ from lab.formats.recording_set import RecordingSet
 from lab.observables.codes.rounding import QUANTISATION_DN2
 from lab.observables.codes.step import find_code_step
 from lab.observables.darks.pixels import stack_of
-from lab.observables.noise.levels import BoolArray, Stack, darks_near, defective_pixels, shading
+from lab.observables.noise.frame_sums import BoolArray
+from lab.observables.noise.levels import darks_near, rounded_c
+from lab.observables.noise.side_levels import grouped
+from lab.observables.noise.stack import Stack
+from lab.observables.noise.surface import defective_pixels, shading
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray
@@ -88,12 +92,12 @@ Map = tuple[FloatArray, FloatArray]  # values and standard deviations
 
 def _levels(captures: list[C]) -> list[list[C]]:
     """Repeats: captures of the same exposure, light, gain and temperature (to a degree)."""
-    groups: dict[Hashable, list[C]] = {}
-    for capture in captures:
+
+    def setting(capture: C) -> Hashable:
         light = (capture.photons_per_pixel, capture.radiance) if isinstance(capture, FlatCapture) else None
-        temperature_c = None if capture.temperature_c is None else round(capture.temperature_c)
-        groups.setdefault((capture.exposure_s, capture.gain_db, temperature_c, light), []).append(capture)
-    return list(groups.values())
+        return capture.exposure_s, capture.gain_db, rounded_c(capture.temperature_c), light
+
+    return grouped(captures, setting)
 
 
 def _pixel_std(stack: Stack) -> float:

@@ -141,12 +141,21 @@ def quantum_efficiency(e: Evaluation) -> dict[str, float | None]:
 
 
 def remark_on_scatter(e: Evaluation) -> None:
-    """Report means that differ beyond noise: between the repeats of a level, or else about a smooth response.
+    """Report means that differ beyond noise: between the repeats of a level, or else about a smooth response; and
+    those of repeated darks, where they differ by more than the noise of a pixel.
 
     Repeats have the same stated light and the same response: what is left is the light itself, or a dark level that
     moves, which the darks show. Levels differ in all of these, so that no cause is named.
     """
     drift, scatter = e.drift, e.consistency.scatter
+    dark_dn = e.dark_scatter_dn([level for level in e.levels.darks if level.drift is None])
+    pixel_dn = float(np.sqrt(max(float(np.mean(e.transfer.floor)), e.levels.quantisation_dn2)))
+    if dark_dn > pixel_dn:
+        e.remarks.add(
+            f"the means of repeated dark frames differ by {dark_dn:.2g} DN (rms), more than the noise of one pixel, "
+            f"{pixel_dn:.2g} DN: frames may be of another exposure or temperature, or the dark level moved; it is in "
+            "the uncertainties of black level, read noise and dark current"
+        )
     if drift.relative > 0:
         cause = (
             "the dark level moved"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from lab.errors import InputError
@@ -22,10 +23,13 @@ from lab.formats.importers.raw_folder import (
 from lab.formats.importers.single_picture import ImportOptions, read_colour_chart, read_slanted_edge
 from lab.formats.recording_set import Manifest, RecordingSet, text_problems
 from lab.plain_text import escaped
+from sim.extensions import extensions, refuse
 
 __all__ = [
     "KINDS",
     "ImportOptions",
+    "Importer",
+    "importers",
     "read_boards",
     "read_checkerboard_pairs",
     "read_colour_chart",
@@ -36,6 +40,10 @@ __all__ = [
     "read_raw_folder",
     "read_slanted_edge",
 ]
+
+
+#: Endings of archives, which are unpacked before an import.
+ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".7z", ".rar")
 
 
 @dataclass(frozen=True)
@@ -79,7 +87,7 @@ def _checkerboards(path: Path, options: ImportOptions) -> RecordingSet:
 
 _HEADERS = frozenset({"--only", "--ignore"})
 _PICTURE = frozenset({"--camera", "--exposure-s", "--transfer"})
-#: `--from KIND` -> its importer.
+#: `--from KIND` -> its importer, of this package.
 KINDS: dict[str, Importer] = {
     "emva1288": Importer(lambda path, _: read_emva1288(path)),
     "raw-folder": Importer(_raw_folder, _HEADERS | {"--checkerboard", "--square-mm", "--tap"}, of_a_folder=True),
@@ -95,19 +103,36 @@ KINDS: dict[str, Importer] = {
 }
 
 
+@cache
+def importers() -> dict[str, Importer]:
+    """Return all importers by their KIND: those above, and entry points of `calibench.importers` in other packages."""
+    found = dict(KINDS)
+    for name, added in extensions("importers"):
+        if not isinstance(added, Importer):
+            refuse("importers", name, f"{added!r} is no lab.formats.importers.Importer")
+        elif name in KINDS:
+            refuse("importers", name, f"there is an importer {name!r} already")
+        else:
+            found[name] = added
+    return found
+
+
 def read_foreign(kind: str, path: Path, options: ImportOptions | None = None) -> RecordingSet:
     """Return the recordings at `path`, which are of `kind`; InputError where there is no such kind, it doesn't take one
     of the options, or the recordings can't be used."""
     options = options or ImportOptions()
-    if kind not in KINDS:
-        raise InputError(f"--from {kind}: no such format; choose {', '.join(KINDS)}")
+    known = importers()
+    if kind not in known:
+        raise InputError(f"--from {kind}: no such format; choose {', '.join(known)}")
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give that of the recordings")
-    importer = KINDS[kind]
+    importer = known[kind]
     if path.is_dir() and importer.of_a_file:
         raise InputError(f"{path}: is a folder; give one picture")
     if path.is_file() and importer.of_a_folder:
-        raise InputError(f"{path}: is a file; give the folder that it is in")
+        is_archive = path.name.lower().endswith(ARCHIVES)
+        remedy = "unpack it, and give the folder" if is_archive else "give the folder that it is in"
+        raise InputError(f"{path}: is a file; {remedy}")
     alien = [name for name in options.stated() if name not in importer.takes]
     if alien:
         takes = ", ".join(sorted(importer.takes)) or "none"

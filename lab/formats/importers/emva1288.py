@@ -195,8 +195,9 @@ def read_emva1288(path: Path) -> RecordingSet:
         unknown.insert(0, "wavelength_nm")
     if unknown:
         warnings.append(
-            f"{file}: says nothing of {', '.join(unknown)}; they stay unknown (the quantum efficiency is that at the "
-            "light's own wavelength): write them to camera.toml beside it where you know them"
+            f"{file}: doesn't state {', '.join(unknown)}"
+            f"{'; the quantum efficiency is that at the wavelength of its light' if wavelength_nm is None else ''}: "
+            "what is unknown stays so; write what you know into camera.toml beside it"
         )
     for capture in captures:
         if capture["kind"] == "flat":

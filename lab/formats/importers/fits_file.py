@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.errors import InputError, one_line
-from lab.formats.importers.frame_settings import KEYWORDS, Value, text_of
+from lab.formats.importers.frame_settings import KEYWORDS, Value, setting_of, text_of
 from lab.formats.recording_set import Frame
 from sim.camera import Cfa
 
@@ -61,6 +61,7 @@ SECONDS = {
     r"minutes?": 60.0,
 }
 _KELVIN = re.compile(r"^\s*\[K\]|\bkelvin\b|\(K\)|\bin K\b", re.I)
+_FAHRENHEIT = re.compile(r"^\s*\[F\]|\bfahrenheit\b|\(F\)|\bdeg(?:rees?)?\.?\s?F\b|°\s?F\b", re.I)
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ def fits_header(file: Path, *, with_image: bool = True, ignored: Collection[str]
         cfa=cfa,
         mosaic_source="" if cfa is None else _mosaic_source(header),
         pixel_pitch_um=_pitch_um(header),
-        settings={key: value for key in KEYWORDS if (value := _setting(header.get(key))) is not None},
+        settings=_settings(header),
         problems=tuple(found.problems),
         remarks=tuple(found.remarks),
     )
@@ -286,6 +287,12 @@ def _setting(value: Any) -> Value | None:
     return number if number is not None else (" ".join(str(value).split()) or None)
 
 
+def _settings(header: Any) -> dict[str, Value]:
+    """Return the listed settings that a header states, in the order of the list, and what else seems to be one."""
+    others = sorted(key for key in set(header) - set(KEYWORDS) if setting_of(key) is not None)
+    return {key: value for key in (*KEYWORDS, *others) if (value := _setting(header.get(key))) is not None}
+
+
 def _pitch_um(header: Any) -> float | None:
     found = {number for key in PITCH_KEYS if (number := _float(header.get(key)))}
     return found.pop() if len(found) == 1 else None
@@ -389,6 +396,10 @@ class _Reading:
         if _KELVIN.search(str(self.header.comments[key])):
             celsius = number + ABSOLUTE_ZERO_C
             self.remarks.append(f"{key} = {number:g} is in kelvin by its comment: read as {celsius:g} degree C")
+            return round(celsius, 9)
+        if _FAHRENHEIT.search(str(self.header.comments[key])):
+            celsius = (number - 32.0) / 1.8
+            self.remarks.append(f"{key} = {number:g} is in degree F by its comment: read as {celsius:g} degree C")
             return round(celsius, 9)
         if not ABSOLUTE_ZERO_C <= number <= HOTTEST_C:
             meant = f", {number + ABSOLUTE_ZERO_C:g} degree C if in kelvin" if number > HOTTEST_C else ""

@@ -74,6 +74,20 @@ SETTINGS = (
     FrameSetting("focal length", SharedBy.VIEW, ("FocalLength", "FOCALLEN"), FOCAL_LENGTH_FACTOR),
 )
 KEYWORDS = {keyword: setting for setting in SETTINGS for keyword in setting.keywords}
+#: Parts of the names of other keywords, which tell that they may be settings too, and what these would change.
+PARTS = {"GAIN": SharedBy.CODES, "SPEED": SharedBy.CODES, "FILT": SharedBy.LIGHT}
+#: Parts of the names of keywords that are no settings of a camera: speed of the wind, of the telescope's motors.
+OTHER_PARTS = ("WIND", "GUIDE", "MOTOR", "SLEW")
+
+
+def setting_of(keyword: str) -> FrameSetting | None:
+    """Return the setting that a keyword states, by the list or by a part of its name; None where it states none."""
+    if keyword in KEYWORDS:
+        return KEYWORDS[keyword]
+    name = keyword.upper()
+    if any(part in name for part in OTHER_PARTS):
+        return None
+    return next((FrameSetting("", changes, (keyword,)) for part, changes in PARTS.items() if part in name), None)
 
 
 def text_of(value: Value) -> str:
@@ -86,7 +100,8 @@ def is_same(keyword: str, one: Value, other: Value) -> bool:
     if isinstance(one, str) or isinstance(other, str):
         return text_of(one).casefold() == text_of(other).casefold()
     low, high = sorted((one, other))
-    return low == high or (low > 0 and high <= low * KEYWORDS[keyword].factor)
+    setting = setting_of(keyword)
+    return low == high or (setting is not None and low > 0 and high <= low * setting.factor)
 
 
 # --- Differences ------------------------------------------------------------------------------------------------------
@@ -114,7 +129,7 @@ def compare_settings(frames: Sequence[StatedFrame], where: str) -> tuple[list[st
             line, is_problem = _first_difference(setting, own, where)
             if line:
                 (problems if is_problem else warnings).append(line)
-        warnings += _unstated(own, where)
+        warnings += [*_unstated(own, where), *_unlisted(own, where)]
     return problems, warnings
 
 
@@ -129,6 +144,21 @@ def _first_difference(setting: FrameSetting, own: Sequence[StatedFrame], where: 
                 if len(values) > 1:
                     return _difference(setting, keyword, values, where, frames is fitted), frames is fitted
     return "", False
+
+
+def _unlisted(own: Sequence[StatedFrame], where: str) -> Iterator[str]:
+    """Yield a line for each keyword that isn't listed, seems to be a setting by its name, and differs within a group of
+    frames. Where each frame has a value of its own, it is a measurement."""
+    for keyword in dict.fromkeys(key for frame in own for key in frame.settings if key not in KEYWORDS):
+        setting = setting_of(keyword)
+        for group in _groups(setting, own) if setting is not None else ():
+            values = _values(keyword, group)
+            if 1 < len(values) < sum(map(len, values.values())):
+                yield (
+                    f"{where}: {keyword} differs between frames that are fitted together: {_listed(values)}; where it "
+                    f"is a setting of the camera, import one group, --only {keyword}={text_of(next(iter(values)))}"
+                )
+                break
 
 
 def _is_bound(setting: FrameSetting, frame: StatedFrame) -> bool:
@@ -175,7 +205,7 @@ def _values(keyword: str, frames: Sequence[StatedFrame]) -> dict[Value, list[Sta
 def _difference(
     setting: FrameSetting, keyword: str, values: Mapping[Value, Sequence[StatedFrame]], where: str, is_problem: bool
 ) -> str:
-    listed = ", ".join(f"{text_of(value)} in {_named(frames)}" for value, frames in values.items())
+    listed = _listed(values)
     if not is_problem:
         return (
             f"{where}: {keyword} ({setting.name}) differs between frames: {listed}; each is fitted by itself, and all "
@@ -190,6 +220,10 @@ def _difference(
         f"{where}: {keyword} ({setting.name}) differs between frames that are fitted together: {listed}; import one "
         f"group, --only {keyword}={text_of(next(iter(values)))}{apart}; where the header is wrong, --ignore {keyword}"
     )
+
+
+def _listed(values: Mapping[Value, Sequence[StatedFrame]]) -> str:
+    return ", ".join(f"{text_of(value)} in {_named(frames)}" for value, frames in values.items())
 
 
 def _named(frames: Sequence[StatedFrame]) -> str:
@@ -235,7 +269,7 @@ def parse_choice(only: str, ignored: str) -> HeaderChoice:
         keyword, equals, value = (text.strip() for text in part.partition("="))
         if not (keyword and equals and value):
             raise InputError(f"--only {part}: give KEY=VALUE, as in GAIN=100")
-        if keyword not in KEYWORDS:
+        if setting_of(keyword) is None:
             raise InputError(f"--only {part}: {keyword} isn't compared; give one of {', '.join(KEYWORDS)}")
         pairs.append((keyword, value))
     return HeaderChoice(tuple(pairs), tuple(filter(None, (text.strip() for text in ignored.split(",")))))
@@ -244,7 +278,8 @@ def parse_choice(only: str, ignored: str) -> HeaderChoice:
 def is_chosen(choice: HeaderChoice, kind: str, settings: Mapping[str, Value]) -> bool:
     """Return whether a frame of a kind is one of those that `only` asks for. A dark needs no setting of the light."""
     for keyword, wanted in choice.only:
-        if kind == "dark" and KEYWORDS[keyword].changes in (SharedBy.LIGHT, SharedBy.VIEW):
+        setting = setting_of(keyword)
+        if kind == "dark" and setting is not None and setting.changes in (SharedBy.LIGHT, SharedBy.VIEW):
             continue
         if not states(settings, keyword, wanted):
             return False

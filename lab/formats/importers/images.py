@@ -144,7 +144,8 @@ def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> 
         except ValidationError as error:
             first = error.errors()[0]
             key = ".".join(str(part) for part in first["loc"])
-            raise InputError(f"{file}: {side} camera: {key}: {first['msg']}; write it in camera.toml") from error
+            said = "is missing" if first["type"] == "missing" else first["msg"]
+            raise InputError(f"{file}: {side} camera: {key}: {said}; write it in camera.toml") from error
     return cameras
 
 

@@ -25,6 +25,8 @@ from sim.camera import Cfa
 #: Orientation of EXIF for each turn that LibRaw states.
 RAW_TURNS = {3: 3, 5: 8, 6: 6}
 MOSAICS = tuple(name for name in get_args(Cfa) if name != "MONO")
+#: Letters of the colours in a TIFF's CFAPattern, in its order (TIFF/EP).
+CFA_COLOURS = "RGBCMYW"
 #: Difference of two levels from which on they contradict each other, DN: files state whole numbers.
 SAME_DN = 1.0
 
@@ -51,17 +53,12 @@ class SensorFacts:
 
 
 def sensor_facts(file: Path, shape: tuple[int, int] | None = None, ignored: Collection[str] = ()) -> SensorFacts:
-    """Return what a raw file, a FITS header without `ignored` keywords, or a TIFF with a description by calibench,
-    states of its sensor; `shape`: of the frame that is read from a raw. Raises InputError, without the path, for a
-    mosaic that calibench has no name for."""
+    """Return what a raw file, a FITS header without `ignored` keywords, or a TIFF by its CFAPattern or a description by
+    calibench, states of its sensor; `shape`: of the frame that is read from a raw. Raises InputError, without the path,
+    for a mosaic that calibench has no name for."""
     suffix = file.suffix.lower()
     if suffix in TIFFS:
-        try:
-            with tifffile.TiffFile(file) as tif:
-                own = TiffDescription.model_validate_json(str(tif.pages[0].tags.valueof("ImageDescription")))
-        except (ValidationError, OSError, ValueError, IndexError, tifffile.TiffFileError):
-            return SensorFacts()
-        return SensorFacts(own.cfa, own.bit_depth, (own.black_level_dn,), own.white_level_dn)
+        return _tiff_facts(file)
     if suffix not in RAWS:
         return _fits_facts(file, ignored) if is_fits(file) else SensorFacts()
     try:
@@ -80,12 +77,37 @@ def sensor_facts(file: Path, shape: tuple[int, int] | None = None, ignored: Coll
             white = float(raw.white_level)
     except rawpy.LibRawError:
         return SensorFacts()
+    return SensorFacts(_known_mosaic(period, letters, names), None, levels, white, turned)
+
+
+def _known_mosaic(period: tuple[int, ...], letters: str, names: str) -> str:
+    """Return the letters of a mosaic of 2 x 2 pixels, row by row. Raises InputError where calibench has no name for it;
+    `names`: of its colours."""
     if period != (2, 2) or letters not in MOSAICS:
         raise InputError(
             f"has a mosaic of {period[0]} x {period[1]} pixels in the colours {names}, not one of "
             f"{', '.join(MOSAICS)}; give frames of such a sensor"
         )
-    return SensorFacts(letters, None, levels, white, turned)
+    return letters
+
+
+def _tiff_facts(file: Path) -> SensorFacts:
+    try:
+        with tifffile.TiffFile(file) as tif:
+            tags = tif.pages[0].tags
+            description = str(tags.valueof("ImageDescription"))
+            period, pattern = tags.valueof("CFARepeatPatternDim"), tags.valueof("CFAPattern")
+    except (OSError, ValueError, IndexError, tifffile.TiffFileError):
+        return SensorFacts()
+    try:
+        own = TiffDescription.model_validate_json(description)
+        return SensorFacts(own.cfa, own.bit_depth, (own.black_level_dn,), own.white_level_dn)
+    except ValidationError:
+        pass
+    if period is None or not isinstance(pattern, bytes) or len(period) != 2 or max(pattern) >= len(CFA_COLOURS):
+        return SensorFacts()
+    letters = "".join(CFA_COLOURS[colour] for colour in pattern)
+    return SensorFacts(_known_mosaic(tuple(period), letters, "".join(dict.fromkeys(letters))))
 
 
 def _fits_facts(file: Path, ignored: Collection[str]) -> SensorFacts:

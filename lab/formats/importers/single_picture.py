@@ -124,7 +124,9 @@ def read_slanted_edge(path: Path, options: ImportOptions) -> RecordingSet:
     try:
         found = find_edges(frame, camera.cfa, camera.saturation_dn)
     except NotDetermined as refused:
-        raise InputError(f"{path}: no slanted edge: {refused.reason}; give a picture of one") from refused
+        is_lossy = path.suffix.lower() in IMAGES and picture_facts(path).is_lossy
+        remedy = "a JPEG changes edges and noise: give the raw or a PNG" if is_lossy else "give a picture of one"
+        raise InputError(f"{path}: no slanted edge: {refused.reason}; {remedy}") from refused
     capture = {"id": "edge", "kind": "slanted_edge"}
     usable = [edge for edge in found if not edge.refused]
     angles = ", ".join(f"{edge.angle_deg:.1f}" for edge in usable)

@@ -355,12 +355,14 @@ def _remarks(seen: Sequence[_HeaderSeen]) -> list[str]:
 
 
 def join_alike(texts: Sequence[tuple[Path | str, str]]) -> list[str]:
-    """Return one line for all files with the same text but for numbers: the first file, its text, and how many more."""
+    """Return one line for all files with the same text but for numbers: the first file, its text, how many more, and
+    whether these have other numbers."""
     found: dict[str, list[tuple[Path | str, str]]] = {}
     for file, text in texts:
         found.setdefault(re.sub(r"[\d.+-]+", "#", text), []).append((file, text))
     return [
         f"{alike[0][0]}{f' and {len(alike) - 1} more' if len(alike) > 1 else ''}: {alike[0][1]}"
+        f"{' (others have other values)' if len({text for _, text in alike}) > 1 else ''}"
         for alike in found.values()
     ]
 

@@ -16,6 +16,7 @@ from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import InputError
+from lab.formats.plausible_range import STATED
 from lab.formats.recording_set.files import Frame
 from lab.formats.recording_set.frame_codes import CodeCounts, FrameCodes
 from lab.formats.recording_set.manifest import DataSheet, Findings
@@ -501,13 +502,14 @@ def _check_cameras(recordings: RecordingSet, found: Findings) -> None:
                 found.problems.append(f"{recordings.where(camera.lens_file)} (lens_file of camera {side}): {error}")
 
 
-def _improbable_squares(capture: Capture) -> Iterator[str]:
-    """Say that the squares of a board are improbably small or large: as a rule, a length in another unit."""
-    from lab.formats.results.plausible import STATED  # here: its figures are those of recording sets' data sheets
-
+def _improbable_values(capture: Capture) -> Iterator[str]:
+    """Yield a line for squares of a board that are improbably small or large, and for an improbable temperature: as a
+    rule, they are in another unit."""
+    stated = {"temperature_c": (capture.temperature_c, "C")}
     if isinstance(capture, CharucoCapture):
-        line = STATED["square_mm"].sentence("square_mm", capture.square_mm, None, "mm")
-        if line is not None:
+        stated["square_mm"] = (capture.square_mm, "mm")
+    for key, (value, unit) in stated.items():
+        if value is not None and (line := STATED[key].sentence(key, value, None, unit)):
             yield line
 
 
@@ -523,7 +525,7 @@ def _check_captures(recordings: RecordingSet, found: Findings) -> None:
         found.warnings += _unknown_keys(where, capture)
         camera = manifest.cameras[capture.side]
         found.problems += [f"{where}: {text}" for text in capture.problems(camera.rows, camera.cols)]
-        for text in (*capture.remarks(), *_improbable_squares(capture)):
+        for text in (*capture.remarks(), *_improbable_values(capture)):
             remarked.setdefault(text, []).append(capture.id)
         first = framed.setdefault(capture.frame, capture)
         if first is not capture and not capture.shares_frame:

@@ -17,6 +17,7 @@ from lab.errors import InputError, NotDetermined
 from lab.formats.recording_set.files import Frame, JoinedFiles, MemoryFiles, OverlaidFiles, RecordingFiles, Target
 from lab.formats.recording_set.frame_codes import FrameCodes
 from lab.formats.recording_set.manifest import DataSheet, Manifest
+from lab.shown import Tabular
 from sim.camera import Side
 from sim.spectrum import Spectrum
 
@@ -41,7 +42,7 @@ class Summaries:
         return Summaries(one, two)
 
 
-class RecordingSet:
+class RecordingSet(Tabular):
     """A manifest with its frames, spectra and targets. Frames are loaded when asked for, and `cache_bytes` of them are
     kept. The codes of every frame are counted once and stay.
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from lab.formats.results.fit import Skipped
+from lab.shown import Tabular
 from sim.camera import Side
 from sim.parameters import Frozen
 
@@ -389,7 +390,7 @@ class DiagnosisLists(Frozen):
         return DiagnosisLists.model_validate(every | {"skipped": tuple(dict.fromkeys(every["skipped"]))})
 
 
-class DiagnosisResult(DiagnosisLists):
+class DiagnosisResult(Tabular, DiagnosisLists):
     """What the first model left out, and how much better the improved model predicts."""
 
     format: Literal["calibench-diagnosis"] = "calibench-diagnosis"

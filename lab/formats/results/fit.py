@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from lab.shown import Tabular
 from sim.camera import ProjectionKind, Side
 from sim.parameters import Frozen
 
@@ -240,7 +241,7 @@ class Emva1288(Frozen):
     remarks: tuple[str, ...] = ()
 
 
-class Emva1288Points(Frozen):
+class Emva1288Points(Tabular, Frozen):
     """The measured points, one entry per level; dark values are at the level's exposure. Empty standard uncertainties:
     of a result of an earlier version.
 
@@ -271,7 +272,7 @@ class Emva1288Points(Frozen):
     stack_images: int | None = None
 
 
-class PhotonTransfer(Frozen):
+class PhotonTransfer(Tabular, Frozen):
     """The points of the photon-transfer and linearity plots, one per level: means over the channel."""
 
     channel: tuple[str, ...]
@@ -515,7 +516,7 @@ class MakerDeparture(Frozen):
     significance_sigma: float
 
 
-class SpectralFit(Frozen):
+class SpectralFit(Tabular, Frozen):
     """Absolute quantum efficiency per channel, electrons per photon; the lens's stated transmittance is divided out.
     Empty where no scale is known, as of a table of means: `relative_sensitivity` stands then."""
 
@@ -544,7 +545,7 @@ class SpectralFit(Frozen):
 # --- Results of the blur fits: modulation transfer functions and point-spread functions -------------------------------
 
 
-class MtfCurve(Frozen):
+class MtfCurve(Tabular, Frozen):
     """Modulation transfer function of one edge in one channel (ISO 12233)."""
 
     capture: str
@@ -665,7 +666,7 @@ class CameraFit(Frozen):
         return (*(drift.statement for drift in self.repeat_drifts), *(remark for own in parts for remark in own))
 
 
-class FitResult(Frozen):
+class FitResult(Tabular, Frozen):
     """All fits of a recording set."""
 
     format: Literal["calibench-fit"] = "calibench-fit"

@@ -1,27 +1,27 @@
 """The range in which each figure of a working camera lies, declared once, and the likely causes of a figure outside it.
 
 A limit is physical (an electron needs a photon), or beyond what sensors and lenses are sold with: its comment says
-which. A figure is reported where it lies outside by more than `OUTSIDE_SIGMA` standard deviations.
+which. A figure is reported where it lies outside by more than `OUTSIDE_SIGMA` standard deviations
+(`lab.formats.plausible_range`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from statistics import median_low
 
 import numpy as np
 from scipy import optimize
 
+from lab.formats.plausible_range import LENGTH_UNIT, STATED, Plausible
 from lab.formats.recording_set import DataSheet
 from lab.formats.results.fit import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, SpectralFit, StereoFit
-from lab.formats.results.words import measured, plain_name, shown_unit, unit_of
+from lab.formats.results.words import plain_name, unit_of
 from sim.camera import Side
 from sim.optics.diffraction import aperture_otf, diffraction_otf
 
-#: Standard deviations: a figure whose true value is on a limit is outside by chance in 0.13 % of all fits.
-OUTSIDE_SIGMA = 3.0
 #: Shortest light of an edge, nm: diffraction spreads all other visible light more.
 SHORTEST_NM = 380.0
 #: Side of a pixel's aperture where the fill factor isn't stated, px. A smaller one loses three quarters of the light.
@@ -30,45 +30,11 @@ LEAST_SIDE_PX = 0.5
 ESTIMATE_ERROR = 0.005
 
 
-@dataclass(frozen=True)
-class Plausible:
-    """The range of a figure. `below`, `above`: likely causes of a figure outside it, and the remedy."""
-
-    lower: float | None
-    upper: float | None
-    below: str = ""
-    above: str = ""
-
-    def is_below(self, value: float, std: float | None) -> bool:
-        """Whether the figure lies below the range by more than its uncertainty."""
-        return self.lower is not None and value + OUTSIDE_SIGMA * (std or 0.0) < self.lower
-
-    def is_above(self, value: float, std: float | None) -> bool:
-        """Whether the figure lies above the range by more than its uncertainty."""
-        return self.upper is not None and value - OUTSIDE_SIGMA * (std or 0.0) > self.upper
-
-    def sentence(self, name: str, value: float, std: float | None = None, unit: str = "1") -> str | None:
-        """Return one line with quantity, value, limit, likely cause and remedy; None where the figure is plausible.
-
-        >>> print(Plausible(0.0, 1.0, above="check it").sentence("share", 2.0, 0.1))
-        share 2.00 ± 0.10 is above the limit of 1: check it
-        """
-        for outside, place, limit, cause in (
-            (self.is_below(value, std), "below", self.lower, self.below),
-            (self.is_above(value, std), "above", self.upper, self.above),
-        ):
-            if outside and limit is not None:
-                bound = f"{limit:.4g} {shown_unit(unit)}".rstrip()
-                return f"{name} {measured(value, std, unit)} is {place} the limit of {bound}: {cause}"
-        return None
-
-
 _AVERAGED = "the repeats may be averaged, denoised or compressed; record single raw frames"
 _SCALED = "codes may be scaled up, or gain_db isn't stated; correct bit_depth or gain_db"
 _RESIZED = "frames may be resized, or binned in one direction; give them as they were read out"
 _CROPPED = "the frames may be cropped off the axis, or the boards don't cover the frame; check them"
-_LENGTH = "a length in another unit, as metres? give it in mm"
-_SQUARES = f"square_mm or marker_mm may be {_LENGTH}"
+_SQUARES = f"square_mm or marker_mm may be {LENGTH_UNIT}"
 
 #: Field of a result, or what is computed from several -> range.
 FIGURES: dict[str, Plausible] = {
@@ -137,6 +103,10 @@ FIGURES: dict[str, Plausible] = {
     "principal point y over the height": Plausible(0.25, 0.75, _CROPPED, _CROPPED),
     # pairs of one module: some mm; pairs on vehicles: a few m
     "baseline_mm": Plausible(1.0, 1e4, _SQUARES, _SQUARES),
+    # light only adds up: a point-spread function without negative values has its highest modulation at frequency 0
+    "mtf": Plausible(
+        None, 1.0, above="the camera may sharpen, or codes may follow a tone curve; switch processing off"
+    ),
     # the upper limit is that of the pixel's aperture and of diffraction
     "mtf50_cy_per_px": Plausible(
         None, 1.0,
@@ -144,21 +114,6 @@ FIGURES: dict[str, Plausible] = {
         "misstated; switch processing off and correct them",
     ),
 }  # fmt: skip
-
-#: Key of a data sheet or a capture -> range, in the unit of its name.
-STATED: dict[str, Plausible] = {
-    # the smallest pixels: 0.5 um; those of X-ray panels: 400 um
-    "pixel_pitch_um": Plausible(0.3, 1e3, "a pitch in mm? give it in um", "a pitch in nm? give it in um"),
-    # the cone of f/0.5 fills half of space; pinholes: f/100 and more
-    "f_number": Plausible(0.5, 1e3, "no lens in air is faster; correct it", "correct it"),
-    "focal_length_mm": Plausible(0.1, 2e4, _LENGTH, _LENGTH),
-    # boards of 25 to 150 mm a square in metres: 0.025 to 0.15; finer ones are targets of microscopes; walls: 1 m
-    "square_mm": Plausible(0.2, 1e3, _LENGTH, _LENGTH),
-    # share of the codes of bit_depth: converters reach most of their codes
-    "white_level_dn over the highest code": Plausible(
-        0.4, 1.0, "bit_depth may be that of the file, not of the converter; correct it", "correct bit_depth"
-    ),
-}
 
 
 def implausible_figures(
@@ -251,12 +206,26 @@ def _of_edges(curves: Sequence[MtfCurve], sheet: DataSheet) -> Iterator[str]:
                 limit = highest_mtf50_cy_per_px(sheet, curve.angle_deg)
                 std = math.hypot(curve.mtf50_cy_per_px_std or 0.0, ESTIMATE_ERROR * limit)
                 found.append(((curve.mtf50_cy_per_px - limit) / std, curve.capture, curve.mtf50_cy_per_px, std, limit))
+        peaks = [_peak_over_one(curve) for curve in curves if curve.channel == channel and curve.mtf]
+        if peaks:
+            _, capture, value, std = median_low(peaks)
+            if line := FIGURES["mtf"].sentence(f"highest MTF {channel} of {capture}", value, std):
+                yield line
         if not found:
             continue
         _, capture, value, std, limit = median_low(found)
         limits = replace(FIGURES["mtf50_cy_per_px"], upper=min(limit, 1.0))
         if line := limits.sentence(f"{plain_name('mtf50_cy_per_px')} {channel} of {capture}", value, std, "cy/px"):
             yield line
+
+
+def _peak_over_one(curve: MtfCurve) -> tuple[float, str, float, float]:
+    """Return by how many standard deviations the highest modulation of an edge up to Nyquist's frequency is above 1,
+    its capture, the modulation, and its standard deviation."""
+    below = np.array(curve.frequency_cy_per_px) <= 0.5
+    value, std = np.array(curve.mtf)[below], np.hypot(np.array(curve.mtf_std)[below], ESTIMATE_ERROR)
+    at = int(np.argmax((value - 1.0) / std))
+    return float((value[at] - 1.0) / std[at]), curve.capture, float(value[at]), float(std[at])
 
 
 def highest_mtf50_cy_per_px(sheet: DataSheet, angle_deg: float = 0.0) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from lab.formats.results.fit import Skipped
+from lab.shown import Tabular
 from sim.camera import Side
 from sim.parameters import Frozen
 
@@ -59,7 +60,7 @@ class Check(Frozen):
     kernels: tuple[KernelPair, ...] = ()
 
 
-class ValidationResult(Frozen):
+class ValidationResult(Tabular, Frozen):
     """All checks of a recording set."""
 
     format: Literal["calibench-validation"] = "calibench-validation"
@@ -119,7 +120,7 @@ class ProjectionChange(Frozen):
     vectors_px: tuple[tuple[tuple[float, float], ...], ...]
 
 
-class ComparisonResult(Frozen):
+class ComparisonResult(Tabular, Frozen):
     """Two calibrations, A and B, compared."""
 
     format: Literal["calibench-comparison"] = "calibench-comparison"

@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from lab.capture_kinds.dark import DarkCapture
 from lab.errors import NotDetermined
 from lab.observables.dataset import Dataset, held_out_of
-from lab.observables.noise.figures import (
+from lab.observables.noise.line_spectra import periodogram, pooled, pooled_along
+from lab.observables.noise.robust import (
     CLIP,
     MEDIAN_OF,
     SMOOTH_PX,
@@ -25,10 +25,9 @@ from lab.observables.noise.figures import (
     from_surroundings,
     local_variance,
     robust_std,
-    sound_pixels,
     without_lines,
 )
-from lab.observables.noise.line_spectra import periodogram, pooled, pooled_along
+from lab.observables.noise.side_levels import usual_darks
 from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 
@@ -108,6 +107,7 @@ class DarkStatistics:
 
     condition: DarkCondition
     means: dict[str, float]  # by capture: mean of the frame without defective pixels, DN
+    mean_dn2: dict[str, float]  # by capture: variance of that mean by the pixels' noise, NaN where it isn't known
     fixed: dict[bool, DarkPattern]  # of at most `MOST_CONDITIONS` conditions
     changing: dict[bool, DarkNoise]
 
@@ -123,21 +123,16 @@ def contrast_weights(condition: DarkCondition, held_out: bool) -> FloatArray:
 
 
 def conditions(dataset: Dataset) -> list[DarkCondition]:
-    """Dark captures by exposure and temperature, at the most frequent gain. The last third of the repeats is held out.
+    """Dark captures by exposure and temperature, at the usual gain. The last third of the repeats is held out.
 
     Two repeats stay together, as temporal noise needs both: in every third condition both are held out. Raises
     NotDetermined without dark captures.
     """
-    captures = dataset.recordings.captures(DarkCapture, dataset.side)
+    captures = usual_darks(dataset.recordings, dataset.side)
     if not captures:
         raise NotDetermined("dark", "no dark captures")
-    gains = [c.gain_db for c in captures]
-    usual = max(dict.fromkeys(gains), key=gains.count)
     groups: list[list[DarkCapture]] = []
-    for c in sorted(
-        (c for c in captures if c.gain_db == usual),
-        key=lambda c: (c.temperature_c is None, c.temperature_c or 0.0),
-    ):
+    for c in sorted(captures, key=lambda c: (c.temperature_c is None, c.temperature_c or 0.0)):
         for group in groups:
             first = group[0]
             same = first.exposure_s == c.exposure_s and (first.temperature_c is None) == (c.temperature_c is None)
@@ -190,20 +185,23 @@ def dark_frames(dataset: Dataset) -> list[DarkStatistics]:
     usual = usual_conditions(dataset, every)
     warmest = max(every, key=lambda c: (c.temperature_c or 0.0, c.exposure_s))
     picked = list(dict.fromkeys([usual[0].name, usual[-1].name, warmest.name]))[:MOST_CONDITIONS]
-    sound = dataset.once(sound_pixels)
-    return [_read(dataset, c, c.name in picked, sound) for c in every]
+    means = {
+        name: (float(mean_dn), level.mean_variance_dn2)
+        for level in dataset.darks.levels
+        for name, mean_dn in zip(level.captures, level.frame_means(), strict=True)
+    }
+    return [_read(dataset, c, c.name in picked, means) for c in every]
 
 
-def _read(dataset: Dataset, condition: DarkCondition, with_pattern: bool, sound: NDArray[np.bool_]) -> DarkStatistics:
-    """Return the statistics of one condition. `sound` (rows, cols): mask of the pixels that count in the frames'
-    means."""
-    means: dict[str, float] = {}
+def _read(
+    dataset: Dataset, condition: DarkCondition, with_pattern: bool, means: dict[str, tuple[float, float]]
+) -> DarkStatistics:
+    """Return the statistics of one condition. `means`: of all frames, with their variance."""
     mean = np.zeros((dataset.camera.rows, dataset.camera.cols), np.float32)
     changing: dict[bool, _Contrasts] = {}
     fixed: dict[bool, _Mean] = {}
     for k, capture in enumerate(condition.captures):
         frame = dataset.recordings.frame(capture).astype(np.float32)
-        means[capture.id] = float(frame.mean(dtype=np.float64, where=sound))
         level = float(frame.mean(dtype=np.float64))
         held_out = k >= len(condition.seen)
         frame -= np.float32(level)
@@ -216,7 +214,8 @@ def _read(dataset: Dataset, condition: DarkCondition, with_pattern: bool, sound:
             fixed.setdefault(held_out, _Mean(mean.shape, dataset.step_dn)).add(frame, capture.id)
     return DarkStatistics(
         condition,
-        means,
+        {c.id: means[c.id][0] for c in condition.captures},
+        {c.id: means[c.id][1] for c in condition.captures},
         {out: part.pattern() for out, part in fixed.items()},
         {out: part.noise() for out, part in changing.items()},
     )

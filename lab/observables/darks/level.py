@@ -13,7 +13,7 @@ from lab.errors import NotDetermined
 from lab.observables.codes.rounding import QUANTISATION_DN2
 from lab.observables.darks.frames import DarkStatistics, conditions, dark_frames
 from lab.observables.dataset import Dataset
-from lab.observables.noise.figures import BLACK_FLOOR_DN, STATED_BLACK_DN, STATED_BLACK_SHARE
+from lab.observables.noise.figures import STATED_BLACK_DN, STATED_BLACK_SHARE
 from lab.observables.noise.line_means import LineMeans
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import DARK_CURRENT, LAG, LINES
@@ -86,7 +86,11 @@ def measure_dark(dataset: Dataset) -> Observable:
 
     # noise of less than about half a code doesn't dither: rounding moves the mean, by its place between two codes
     coarse = np.array([_rounding_dn(f, noise.step_dn) for f in frames for _ in f.condition.captures])
-    floor_dn = BLACK_FLOOR_DN * noise.step_dn
+    # where no frame is repeated, by the read noise that is taken elsewhere
+    pixels = dataset.camera.rows * dataset.camera.cols
+    usual_dn2 = (noise.read_dn**2 + noise.gain * noise.dark_dn_per_s * exposures) / pixels
+    own_dn2 = np.array([f.mean_dn2[c.id] for f in frames for c in f.condition.captures])
+    own_dn2 = np.where(np.isfinite(own_dn2), own_dn2, usual_dn2)
     same = np.array([[a[1] is b[1] for b in captures] for a in captures])
     # the coordinate of smoothness: 10 degrees count as twice the range of exposures
     reach = float(max(np.ptp(exposures), 1e-3))
@@ -98,7 +102,7 @@ def measure_dark(dataset: Dataset) -> Observable:
     )
     return Observable(
         measurement=DARK, reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
-        covariance=(noise.dark_jitter_dn**2 + floor_dn**2) * np.eye(len(value)) + same * np.outer(coarse, coarse),
+        covariance=np.diag(own_dn2 + noise.white_jitter_dn**2) + same * np.outer(coarse, coarse),
         labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
         reads=LAG | DARK_CURRENT | {"signal.offset_dn", "signal.exposure_offset_dn", "codes.codes"},
         scattered_by=LINES, predict=predict,

@@ -16,7 +16,8 @@ from lab.observables.darks.frames import (
 )
 from lab.observables.darks.level import added_dark_e_per_s
 from lab.observables.dataset import Dataset
-from lab.observables.noise.figures import CLIP
+from lab.observables.flats.noise import GAIN_STD
+from lab.observables.noise.robust import CLIP
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import DARK_CURRENT, LAG, LINES, PARTICLES, acting
 from sim.effects.base import Effects
@@ -65,7 +66,7 @@ def measure_dark_noise(dataset: Dataset) -> Observable:
     base = shortest + dark - float(dark.min())
     # relative prior standard deviation of the gain: measured by flats, stated, or unknown
     flats = len(dataset.flat_levels()) > 1
-    gain_std = 0.05 if flats else 0.3 if dataset.stated.conversion_gain_dn_per_e is not None else 10.0
+    gain_std = GAIN_STD if flats else 0.3 if dataset.stated.conversion_gain_dn_per_e is not None else 10.0
 
     def predict(effects: Effects) -> Prediction:
         mean = base.copy()
@@ -81,7 +82,10 @@ def measure_dark_noise(dataset: Dataset) -> Observable:
             mean[i] += shot[i] - dark[i]
             mean[i] += _defect_variance(model, noise.gain, t, float(value[i])) + noise.gain**2 * lines
             mean[i] += _particle_variance(dataset, model, f.condition, out, float(value[i]))
-        # flats measure K F^2, by which the dark signal's shot noise is predicted, too: an excess factor leaves it
+        if model.changes_shot_noise:  # as flats have it, by which the gain is known
+            e = np.maximum(shot, 0.0) / noise.gain**2
+            kept = noise.gain**2 * model.shot_e2(e, dataset.usual_gain_db)
+            mean, shot = mean + kept - shot, kept
         jacobian = {
             "dark_read": np.full(len(points), 0.5 * shortest + 0.1),
             "dark": noise.gain * exposures * noise.dark_std,
@@ -102,7 +106,8 @@ def measure_dark_noise(dataset: Dataset) -> Observable:
         covariance=covariance,
         labels=tuple(Label(f.condition.exposure_s, "all", f.condition.name, captures_of(f, out), out) for f, out,
         _ in points),
-        reads=DEFECTS | DARK_CURRENT | LAG | LINES | PARTICLES, predict=predict, scale=value,
+        reads=DEFECTS | DARK_CURRENT | LAG | LINES | PARTICLES | {"charge.excess", "charge.variance_e2"},
+        predict=predict, scale=value,
     )  # fmt: skip
 
 

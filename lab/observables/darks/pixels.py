@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -13,7 +14,8 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Defect, PixelDefects, ReadNoiseDistribution
 from lab.observables.codes.rounding import QUANTISATION_DN2
-from lab.observables.noise.levels import BoolArray, Float32Array, Stack
+from lab.observables.noise.frame_sums import BoolArray, Float32Array
+from lab.observables.noise.stack import Stack
 from lab.observables.weighted_lines import root
 from sim.camera import Cfa
 from sim.sensor.mosaic import planes
@@ -38,6 +40,37 @@ def stack_of(
     for capture in captures:
         stack.add(recordings.frame(capture))
     return stack
+
+
+@dataclass(frozen=True)
+class PixelFigures:
+    """What darks say of single pixels. Electrons are those of a gain of 1 DN/e, until `at_gain` counts them."""
+
+    noise: ReadNoiseDistribution | None = None
+    defects: PixelDefects | None = None
+
+    @property
+    def number(self) -> int:
+        """Number of defective pixels."""
+        return 0 if self.defects is None else self.defects.hot + self.defects.cold
+
+    def at_gain(self, gain_dn_per_e: float) -> PixelFigures:
+        """Return the figures at a conversion gain."""
+        noise, defects = self.noise, self.defects
+        if noise is not None:
+            names = "rms_e", "median_e", "percentile_95_e", "percentile_99_e"
+            update: dict[str, Any] = {name: getattr(noise, name) / gain_dn_per_e for name in names}
+            update["noise_e"] = tuple(edge / gain_dn_per_e for edge in noise.noise_e)
+            noise = noise.model_copy(update=update)
+        if defects is not None:
+            currents = [pixel.dark_current_e_per_s for pixel in defects.listed]
+            scaled = [None if current is None else current / gain_dn_per_e for current in currents]
+            listed = (
+                pixel.model_copy(update={"dark_current_e_per_s": current})
+                for pixel, current in zip(defects.listed, scaled, strict=True)
+            )
+            defects = defects.model_copy(update={"listed": tuple(listed)})
+        return PixelFigures(noise, defects)
 
 
 @dataclass
@@ -72,7 +105,11 @@ class DarkPixels:
             self.longest, self.longest_s = stack.mean, exposure_s
         self.shortest, self.shortest_s = stack.mean, exposure_s
 
-    def defects(self, gain_dn_per_e: float) -> PixelDefects | None:
+    def figures(self) -> PixelFigures:
+        """Return what was gathered, small against frames."""
+        return PixelFigures(read_noise_distribution(self), self.defects())
+
+    def defects(self) -> PixelDefects | None:
         """Pixels that stand out of the longest dark, the strongest listed; None without darks or defects mask."""
         if self.bad is None or self.longest is None:
             return None
@@ -84,7 +121,7 @@ class DarkPixels:
             growth = self.longest - self.shortest
             for image in planes(growth, self.cfa).values():
                 np.subtract(image, np.median(image), out=image)
-            growth = growth / (self.longest_s - self.shortest_s) / gain_dn_per_e
+            growth = growth / (self.longest_s - self.shortest_s)
         where = np.argwhere(self.bad)
         strongest = where[np.argsort(-np.abs(above[self.bad]), kind="stable")][:LISTED_DEFECTS]
         return PixelDefects(
@@ -109,9 +146,9 @@ def _median_variance(squares: Float32Array) -> float:
     return float(np.median(squares[::apart, ::apart]))
 
 
-def read_noise_distribution(dark: DarkPixels, gain_dn_per_e: float) -> ReadNoiseDistribution | None:
-    """Distribution of the temporal noise of the pixels in the dark; None without repeats, or where rounding hides the
-    noise.
+def read_noise_distribution(dark: DarkPixels) -> ReadNoiseDistribution | None:
+    """Distribution of the temporal noise of the pixels in the dark, at a gain of 1 DN/e; None without repeats, or where
+    rounding hides the noise.
 
     The sample variance of a pixel with nu degrees of freedom varies by itself: var(s^2) = 2 sigma^4 / nu + (1 + 2 /
     nu) var(sigma^2) over the pixels. This is solved for the true relative spread var(sigma^2)^(1/2) / sigma^2.
@@ -136,7 +173,7 @@ def read_noise_distribution(dark: DarkPixels, gain_dn_per_e: float) -> ReadNoise
     spread2_std = float(influence.std()) / np.sqrt(count) / (1.0 + 2.0 / nu)
     spread, spread_std = root(spread2, spread2_std)
     rounding = middle / (middle - quantisation_dn2)  # the variance of rounding is common to all pixels
-    noise = np.sqrt(np.maximum(variance - quantisation_dn2, 0.0)) / gain_dn_per_e
+    noise = np.sqrt(np.maximum(variance - quantisation_dn2, 0.0))
     pixels, edges = np.histogram(noise, HISTOGRAM_BINS, (0.0, float(np.percentile(noise, 99.9)) * 1.2))
     return ReadNoiseDistribution(
         degrees_of_freedom=nu,

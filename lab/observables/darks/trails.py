@@ -13,7 +13,7 @@ import numpy as np
 from lab.errors import NotDetermined
 from lab.observables.darks.frames import DarkStatistics, captures_of, dark_frames
 from lab.observables.dataset import Dataset
-from lab.observables.noise.figures import MEDIAN_OF, Image, from_surroundings
+from lab.observables.noise.robust import MEDIAN_OF, Image, from_surroundings
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
 from sim.point import trail_behind

@@ -11,7 +11,7 @@ import numpy as np
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
 from lab.observables.dataset import Dataset
-from lab.observables.flats.field import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
+from lab.observables.flats.images import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
 from lab.observables.noise.figures import BLACK_FLOOR_DN
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import COLLECTED, LINE_GAINS, acting

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy import optimize, special
 
 from lab.errors import NotDetermined
-from lab.observables.codes.rounding import QUANTISATION_DN2
 from lab.observables.noise.levels import MeasuredLevel, RecordedLevels, Remarks
 from lab.observables.weighted_lines import DarkLine, chi2_factor, dark_line, least_squares
 from sim.spectrum import FloatArray
@@ -68,13 +67,11 @@ def mean_and_std(levels: Sequence[MeasuredLevel], names: Sequence[str]) -> tuple
     means, stds, rounding, excess, freedom = [], [], [], 0.0, 0
     for level in levels:
         own = [level.plane[n] for n in names]
-        pixels = np.array([plane.pixels for plane in own])
+        pixels = sum(plane.pixels for plane in own)
         rounding.append(max(plane.mean_rounding_std for plane in own))  # the errors of the planes are correlated
-        frames = np.average([plane.frame_means for plane in own], axis=0, weights=pixels)
-        variance = np.average([plane.temporal_variance for plane in own], weights=pixels)
-        noise = max(float(variance), QUANTISATION_DN2 * own[0].step_dn ** 2) if np.isfinite(variance) else float("nan")
+        frames = level.frame_means(names)
         means.append(float(frames.mean()))
-        stds.append(np.sqrt(noise / pixels.sum()))
+        stds.append(np.sqrt(level.pixel_variance_dn2(names) / pixels))
         if len(frames) > 1:
             rest, free = level.scatter(frames)
             excess += float(np.sum(rest**2) / stds[-1] ** 2)

@@ -14,7 +14,7 @@ from scipy.special import polygamma
 from lab.errors import NotDetermined
 from lab.observables.darks.readout import OFFSETS_STD, DarkReadOut, dark_readout
 from lab.observables.dataset import Dataset
-from lab.observables.flats.field import LEAST_SIGNAL, dark_level_dn, even_lines, flats
+from lab.observables.flats.images import LEAST_SIGNAL, dark_level_dn, even_lines, flats
 from lab.observables.noise.line_spectra import log_mean_bias
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import COLLECTED, GAINS, LINE_GAINS, acting

@@ -15,7 +15,7 @@ from sim.spectrum import FloatArray
 from sim.uniform import Uniform, noise_values
 
 VARIANCE_FLOOR = 0.002  # relative standard deviation of a variance beside chance: rounding, a few clipped pixels
-GAIN_STD, READ_STD = 0.3, 0.3  # relative prior standard deviations of conversion gain and dark variance
+GAIN_STD, READ_STD = 1.0, 0.3  # relative prior standard deviations of conversion gain and dark variance
 
 
 def measure_noise(dataset: Dataset) -> Observable:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from lab.errors import NotDetermined
 from lab.observables.darks.readout import OFFSETS_STD, dark_readout
 from lab.observables.dataset import Dataset
-from lab.observables.flats.field import LINE_FLOOR, collect_rows, flats, without_dark
+from lab.observables.flats.images import collect_rows, flats, without_dark
+from lab.observables.noise.robust import median_std
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import COLLECTED, acting
 from sim.effects.base import Effects
@@ -60,11 +61,12 @@ class _Rows:
         found = np.bincount(self.place, self.rough(line)) / np.bincount(self.place)
         return np.asarray(found - found.mean())
 
-    def spread(self, line: FloatArray) -> float:
-        """Standard deviation of a row by all that doesn't repeat: from rows one period apart, by the median."""
+    def spread(self, line: FloatArray, least: float) -> float:
+        """Standard deviation of a row by all that doesn't repeat: from rows one period apart, `least` by derived
+        noise."""
         rough = self.rough(line)
-        away = rough[self.period :] - rough[: -self.period]
-        return 1.4826 * float(np.median(np.abs(away))) / np.sqrt(2.0) if len(away) else 0.0
+        away = (rough[self.period :] - rough[: -self.period]) / np.sqrt(2.0)
+        return median_std(away, least)
 
 
 def measure_row_periods(dataset: Dataset) -> Observable:
@@ -72,8 +74,8 @@ def measure_row_periods(dataset: Dataset) -> Observable:
 
     In a mosaic even and odd pixels of the rows are apart, each colour's plane over its mean. What is smooth over a
     period is the light's. What dark frames have is subtracted, and may be another in light by `OFFSETS_STD`. The
-    standard deviation of a row is measured on rows one period apart, and is that by noise and PRNU at least. Raises
-    NotDetermined without unclipped flats, and for frames too low.
+    standard deviation of a row is that by noise and PRNU, or that of rows one period apart where these differ more.
+    Raises NotDetermined without unclipped flats, and for frames too low.
     """
     levels, images = dataset.once(flats)
     if not images:
@@ -95,12 +97,12 @@ def measure_row_periods(dataset: Dataset) -> Observable:
             )
             pixels = dataset.camera.cols // step
             least2 = (dataset.noise.prnu**2 + of_dark + noise) / pixels
-            row2 = max(rows.spread(line) ** 2, least2) / count
+            row2 = rows.spread(line, float(np.sqrt(least2))) ** 2 / count
             shot2 = np.minimum(noise / pixels / count, row2)
             values.append(rows.means(line))
             own.append(shot2)
             subtracted = OFFSETS_STD * rows.means(with_dark - line)
-            shared.append(row2 - shot2 + np.square(subtracted) + LINE_FLOOR**2)
+            shared.append(row2 - shot2 + np.square(subtracted))
             name = "row" if step == 1 else f"row, {('even', 'odd')[first]} columns"
             labels += [Label(float(k), "all", f"{name} {k}", members, held_out) for k in range(rows.period)]
     # the means lack their own mean: of 48 numbers, each has 2 % less variance than is said here

@@ -12,7 +12,7 @@ import numpy as np
 from lab.errors import NotDetermined
 from lab.observables.darks.readout import DarkRowPower, dark_readout, row_profile
 from lab.observables.dataset import Dataset, held_out_flats
-from lab.observables.flats.field import LEAST_SIGNAL, dark_level_dn
+from lab.observables.flats.images import LEAST_SIGNAL, dark_level_dn
 from lab.observables.flats.row_light import PHASES, ROW_LIGHT
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import ADDED, LEAK

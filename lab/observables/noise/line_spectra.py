@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import digamma, polygamma
 
-from lab.observables.noise.figures import Image
+from lab.observables.noise.robust import Image
 from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 

@@ -137,16 +137,19 @@ class OrderedCovariance:
         alternating = noise.plane_e2(shape, np.full(len(down_cy_per_px), 0.5), down_cy_per_px)
         return OrderedCovariance(float(np.mean(own)), shared, alternating, camera.rows * camera.cols)
 
-    def taken_out_e2(self, total_e2: float, down: int, right: int) -> float:
-        """Return the covariance of pixels so far apart that tones have which are taken out: powers that by chance, each
-        distributed exponentially, exceed `OUTLIER`^2 of the mean power, a pixel's variance."""
+    def taken_out_e2(self, total_e2: float) -> dict[tuple[int, int], float]:
+        """Return the covariances of pixels, by (rows down, columns to the right) of `PAIRS`, that tones have which are
+        taken out: powers that by chance, each distributed exponentially, exceed `OUTLIER`^2 of the mean power, a
+        pixel's variance."""
+        lags = [lag for every in PAIRS.values() for lag in every]
         if not len(self.alternating_e2):
-            return 0.0
+            return dict.fromkeys(lags, 0.0)
         mean = self.alternating_e2 + total_e2 - self.own_e2
         least = OUTLIER**2 * total_e2
         taken = (least + mean) * np.exp(-least / mean)
-        turn = 2.0 * np.pi * down * np.arange(1, len(taken) + 1) / (len(taken) + 1)
-        return float(np.sum(taken * np.cos(turn)) * (-1.0) ** right / self.pixels)
+        cycles = np.arange(1, len(taken) + 1) / (len(taken) + 1)
+        by_rows = {down: float(taken @ np.cos(2.0 * np.pi * down * cycles)) for down in {down for down, _ in lags}}
+        return {(down, right): by_rows[down] * (-1.0) ** right / self.pixels for down, right in lags}
 
 
 def correlations(
@@ -172,12 +175,63 @@ def correlations(
     variance, taken = np.zeros((period, period)), np.zeros((len(NEIGHBOURS), period, period))
     for name, v, g in zip(planes, shot_e2, share.T, strict=True):
         variance[at[name]], taken[:, *at[name]] = v, g
+    own, shared = (
+        _covariances(variance, taken, read_e2, kernel, read_kernel)
+        if kernel is not None or taken.any()
+        else _without_neighbours(variance, read_e2, read_kernel)
+    )
+    total = {p: e2 + rounding_e2 + sum(o.own_e2 for o in ordered) for p, e2 in own.items()}
+    whole = float(np.mean(list(total.values())))
+    taken_out = [noise.taken_out_e2(whole) for noise in ordered]
+    found = np.zeros(len(PAIRS))
+    for k, lags in enumerate(PAIRS.values()):
+        parts = []
+        for phase, own_e2 in total.items():
+            for down, right in lags:
+                other = (phase[0] + down) % period, (phase[1] + right) % period
+                e2 = shared[phase, (down, right)]
+                for noise, less in zip(ordered, taken_out, strict=True):
+                    e2 += noise.shared_e2[phase[1], down, right] - less[down, right]
+                parts.append(e2 / np.sqrt(own_e2 * total[other]))
+        found[k] = np.mean(parts)
+    return found
+
+
+#: A pixel of the mosaic's period, and (rows down, columns to the right).
+_Phase = tuple[int, ...]
+_Lag = tuple[int, int]
+
+
+def _without_neighbours(
+    variance: FloatArray, read_e2: float, read_kernel: FloatArray | None
+) -> tuple[dict[_Phase, float], dict[tuple[_Phase, _Lag], float]]:
+    """Return the same as `_covariances` where no pixel takes anything over and nothing is filtered."""
+    along = np.ones(1) if read_kernel is None else np.correlate(read_kernel, read_kernel, mode="full")
+    middle = len(along) // 2
+    reach = {(0, right): read_e2 * float(along[middle + right]) for right in range(-middle, middle + 1)}
+    phases = list(np.ndindex(variance.shape))
+    lags = [lag for every in PAIRS.values() for lag in every]
+    own = {phase: float(variance[phase]) + reach[0, 0] for phase in phases}
+    return own, {(phase, lag): reach.get(lag, 0.0) for phase in phases for lag in lags}
+
+
+def _covariances(
+    variance: FloatArray,
+    taken: FloatArray,
+    read_e2: float,
+    kernel: FloatArray | None,
+    read_kernel: FloatArray | None,
+) -> tuple[dict[_Phase, float], dict[tuple[_Phase, _Lag], float]]:
+    """Return the variance of a pixel by its phase in the mosaic, and its covariance with those of `PAIRS`, e^2.
+
+    `variance` (period, period) of the shot noise; `taken` (5, period, period): shares of neighbours' departures.
+    """
+    period = len(variance)
     taps = np.ones((1, 1)) if kernel is None else kernel
     half = taps.shape[0] // 2 * period + 2
     reach = half + 2 + (0 if read_kernel is None else len(read_kernel) // 2)
     size = 2 * reach + 1
     offset = np.arange(size) - reach
-    found = np.zeros(len(PAIRS))
     weights: dict[tuple[int, int], FloatArray] = {}  # (shot and read noise, size, size)
     for phase in np.ndindex(period, period):
         row, col = (phase[0] + offset) % period, (phase[1] + offset) % period
@@ -193,21 +247,14 @@ def correlations(
         if read_kernel is not None:
             read = convolve1d(read, read_kernel, axis=1, mode="constant")
         weights[phase] = np.stack([shot * np.sqrt(own), read * np.sqrt(read_e2)])
-    total = {p: float(np.vdot(w, w)) + rounding_e2 + sum(o.own_e2 for o in ordered) for p, w in weights.items()}
-    whole = float(np.mean(list(total.values())))
-    for k, lags in enumerate(PAIRS.values()):
-        parts = []
-        for phase, here in weights.items():
-            for down, right in lags:
-                other = (phase[0] + down) % period, (phase[1] + right) % period
-                mine = here[:, max(down, 0) : size + min(down, 0), max(right, 0) : size + min(right, 0)]
-                theirs = weights[other][:, max(-down, 0) : size - max(down, 0), max(-right, 0) : size - max(right, 0)]
-                shared = float(np.sum(mine * theirs))
-                for noise in ordered:
-                    shared += noise.shared_e2[phase[1], down, right] - noise.taken_out_e2(whole, down, right)
-                parts.append(shared / np.sqrt(total[phase] * total[other]))
-        found[k] = np.mean(parts)
-    return found
+    shared: dict[tuple[_Phase, _Lag], float] = {}
+    for phase, here in weights.items():
+        for down, right in (lag for every in PAIRS.values() for lag in every):
+            other = (phase[0] + down) % period, (phase[1] + right) % period
+            mine = here[:, max(down, 0) : size + min(down, 0), max(right, 0) : size + min(right, 0)]
+            theirs = weights[other][:, max(-down, 0) : size - max(down, 0), max(-right, 0) : size - max(right, 0)]
+            shared[phase, (down, right)] = float(np.sum(mine * theirs))
+    return {phase: float(np.vdot(w, w)) for phase, w in weights.items()}, shared
 
 
 def _neighbours(values: FloatArray, places: Sequence[tuple[int, int]]) -> FloatArray:

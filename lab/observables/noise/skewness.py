@@ -20,7 +20,6 @@ from lab.observables.noise.temporal import ENOUGH, OUTLIER
 from lab.observables.observable import LEVEL_REACH, Label, Measurement, Observable, Prediction
 from lab.observables.plane_means import channel_pixels
 from sim.effects.base import Effects
-from sim.sensor.electrons import multiplied_skewness
 from sim.uniform import Uniform
 
 LEAST_REPEATS = 3  # of an unbiased third moment
@@ -127,7 +126,7 @@ def _predicted(dataset: Dataset, model: Uniform, effects: Effects, p: _Skewness)
     normal noise gets skewed; what scales the noise by s leaves s^3 of the third moment over s^4; a filter k of a plane
     leaves sum k^3 / (sum k^2)^2."""
     excess = model.excess_factor(p.gain_db)
-    value = multiplied_skewness(excess)
+    value = model.multiplied_skewness(p.gain_db)
     gain = dataset.noise.gain * p.gain
     electrons, _ = behind(np.array([p.signal_dn / gain]), np.ones(1), effects, dataset)
     e = float(electrons[0, 0])

@@ -256,7 +256,9 @@ def test_a_session_that_demands_a_certified_calibration_runs_only_with_one(store
     bench = fake_bench.Bench()
 
     def session() -> CaptureSession:
-        return CaptureSession.start(store, STATION, DARKS, demands_certified=True, connect=bench.drivers)
+        return CaptureSession.start(
+            store, STATION, DARKS, demands_certified=True, connect=bench.drivers, check_certified=life.check_certified
+        )
 
     first = session()
     with pytest.raises(InputError, match="demands a certified calibration, and 0 calibrations"):
@@ -281,9 +283,10 @@ def test_a_session_that_demands_a_certified_calibration_runs_only_with_one(store
     with pytest.raises(InputError, match=f"{of_it}, is of other cameras: left was fake camera left SN-1, is .* SN-2"):
         session().run()
     bench.serials.clear()
-    assert (
-        CaptureSession(store, first.id, connect=bench.drivers).run().state == "finished"
-    )  # a resumed one is looked at anew
+    with pytest.raises(InputError, match="nothing here checks it"):
+        CaptureSession(store, first.id, connect=bench.drivers).run()
+    again = CaptureSession(store, first.id, connect=bench.drivers, check_certified=life.check_certified)
+    assert again.run().state == "finished"  # a resumed one is looked at anew
     with store.transaction() as db:
         db.execute(sa.update(CalibrationRow).values(expires=now() - timedelta(days=1)))
     with pytest.raises(InputError, match="expired on"):

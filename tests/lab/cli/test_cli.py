@@ -24,13 +24,13 @@ import lab.diagnose
 import lab.fit
 from lab import cli
 from lab.capture.by_hand import HandChange, LeftByHand
+from lab.capture.data_folder import open_store
 from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession
 from lab.capture_kinds.dark import DarkSequence
 from lab.cli import bench_process, capturing, diagnosis, entry, fitting
 from lab.cli.console import EXIT_INPUT
 from lab.cli.help import help_and_example
-from lab.cli.sources import open_store
 from lab.diagnose import Diagnosis
 from lab.diagnose.visibility import EffectList, effect_list
 from lab.errors import DeviceError
@@ -569,9 +569,7 @@ SLOW_TO_LOAD = [
 ]
 
 
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["run", "--help"], ["challenge", "score", "--help"], ["bench", "--help"]]
-)
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["twin", "score", "--help"], ["bench", "--help"]])
 def test_the_help_waits_for_no_numerics(arguments: list[str]) -> None:
     """What a command needs is loaded when it runs, so that the help of all of them needs none of it."""
     told = (
@@ -851,10 +849,6 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
         ["lens", "lens.zmx", "--report", "OUT"],
         ["simulate", "colorchecker", "--out", "OUT.npy"],
         ["simulate", "--write-camera", "OUT"],
-        ["challenge", "make", "--seed", "1", "--out", "OUT"],
-        ["challenge", "make", "--seed", "1", "--out", "DIR", "--truths", "OUT"],
-        ["challenge", "score", "SET", "--truths", "FILE", "--json", "OUT"],
-        ["challenge", "score", "SET", "--truths", "FILE", "--page", "OUT"],
         ["twin", "predict", "MODEL", "--plan", "SET", "--out", "OUT"],
         ["twin", "score", "SEALED", "SET", "--json", "OUT"],
         ["twin", "budget", "MODEL", "--use", "variance", "--json", "OUT"],
@@ -881,12 +875,18 @@ def test_an_output_that_cannot_be_written_is_refused_first(
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.parametrize("words", [[], ["make", "--out", "DIR", "--cases", "1"], ["score", "--help"]])
+def test_the_removed_challenge_says_what_took_its_place(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["challenge", *words]) == 2
+    line = " ".join(capsys.readouterr().err.split())
+    assert line.startswith("calibench: challenge: ") and "`python -m evaluation`" in line
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
         ["diagnose", "SET", "--bootstrap", "10"],
         ["lens", "FILE.zmx"],
-        ["challenge", "make", "--seed", "1", "--out", "DIR"],
     ],
 )
 def test_a_cluster_that_is_not_there_is_said_before_the_work(

@@ -34,7 +34,6 @@ COMMANDS = (
     "report ID --data DATA --out DISK/out/report.html",
     "backup DISK/out/backup --data DATA",
     "serve --port 0 --data DATA",
-    "challenge make --out DISK/out/challenge --cases 1",
     "simulate uniform --out DISK/out/frame.npy",
 )
 WRONG = ("defect", "start it", "DATABASE_URL", "Traceback", "is yours")

@@ -8,7 +8,8 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
@@ -17,7 +18,6 @@ from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.dataset import Dataset
 from lab.observables.gaussian import chi2
 from lab.observables.observable import Measurement, Observable
-from mocks.former import ConcealedCamera, Law, Plan
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.frame import Exposure, sample

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
 from lab.diagnose import diagnose
 from lab.formats.recording_set import Manifest, RecordingSet
-from mocks.former import ConcealedCamera, Plan
 
 
 @pytest.fixture(scope="module")

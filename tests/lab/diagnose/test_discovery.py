@@ -9,17 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lab.challenge.draw import recording_set, recordings_of
-from lab.diagnose import diagnose, discovery, examine
-from lab.diagnose.discovery import PredictiveTable, discover, law_of
-from lab.diagnose.discovery.profile import Profile, curve_forms, description_length, fitted, formulas
-from lab.diagnose.inference.side_model import dataset_of
-from lab.diagnose.policy import DecisionPolicy
-from lab.fit import FOR_DIAGNOSIS, fit_recording_set
-from lab.formats.importers import ImportOptions, read_foreign
-from lab.formats.recording_set import RecordingSet, read, write
-from mocks.former import ConcealedCamera, Law, Plan, record
-from mocks.former.laws import (
+from evaluation.draw import recording_set, recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan, record
+from evaluation.independent_simulator.laws import (
     AbsorptionBandLaw,
     DigitalGainLaw,
     LampJumpLaw,
@@ -28,7 +20,7 @@ from mocks.former.laws import (
     TapOffsetLaw,
     TreeRingsLaw,
 )
-from mocks.former.unlisted import (
+from evaluation.independent_simulator.unlisted import (
     BankNoiseLaw,
     CoarseTopLaw,
     ColumnAmplifiersLaw,
@@ -43,6 +35,14 @@ from mocks.former.unlisted import (
     WarmingNoiseLaw,
     WavyColumnsLaw,
 )
+from lab.diagnose import diagnose, discovery, examine
+from lab.diagnose.discovery import PredictiveTable, discover, law_of
+from lab.diagnose.discovery.profile import Profile, curve_forms, description_length, fitted, formulas
+from lab.diagnose.inference.side_model import dataset_of
+from lab.diagnose.policy import DecisionPolicy
+from lab.fit import FOR_DIAGNOSIS, fit_recording_set
+from lab.formats.importers import ImportOptions, read_foreign
+from lab.formats.recording_set import RecordingSet, read, write
 from sim.effects.column_noise import ColumnNoise
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator.law import Array
 from lab import cli
-from lab.challenge.draw import recordings_of
 from lab.diagnose.effect_draft import draft, place_of_test
 from lab.formats.recording_set import write
 from lab.formats.results import DiscoveredLaw
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.law import Array
 from sim.effects.empirical_law import PLACES
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -34,9 +34,9 @@ import json
 import sys
 import sim.effects
 sim.effects.__path__.append(sys.argv[1])
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
 from lab.diagnose import diagnose
-from mocks.former import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
 from sim.effects.library import effect
 from sim.stages import codes_of
 

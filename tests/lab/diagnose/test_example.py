@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from scipy import stats
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
+from evaluation.independent_simulator import laws as concealed_laws
 from lab.diagnose import diagnose, examine
 from lab.formats.importers import read_foreign
 from lab.formats.recording_set import inspect
-from mocks.former import ConcealedCamera, Plan
-from mocks.former import laws as concealed_laws
 
 ROOT = Path(__file__).parents[3]
 DATA = ROOT.parent / "shared" / "data"

@@ -16,7 +16,6 @@ from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.acquisition_errors import exchanged_frames
 from lab.observables.darks.frames import dark_frames
 from lab.observables.dataset import Dataset, mean_frame
-from lab.observables.noise.figures import TemporalVariance
 
 SIDE_PX = 256  # the counts of codes, which are kept of every frame, take some 4 kB whatever its size
 BLACK_DN, READ_DN, GAIN = 64.0, 3.0, 0.4
@@ -89,18 +88,3 @@ def test_repeats_take_no_memory(step: str) -> None:
     STEPS[step](_recordings(2))  # loads what is loaded once
     few, many = 16, 48
     assert peak_bytes(many) - peak_bytes(few) < 0.5 * (many - few) * 2 * SIDE_PX**2
-
-
-def test_a_temporal_variance_is_that_of_the_whole_stack() -> None:
-    """Up to rounding, beside a fixed pattern a hundred times the noise and levels that differ."""
-    rng = np.random.default_rng(1)
-    stack = 3000.0 + 300.0 * rng.standard_normal((12, 16)) + 3.0 * rng.standard_normal((9, 12, 16))
-    stack += rng.standard_normal((9, 1, 1))
-    repeats = TemporalVariance()
-    assert repeats.variance_dn2 == 0.0
-    for frame in stack:
-        repeats.add(frame)
-    away = stack - stack.mean((1, 2), keepdims=True)
-    # the mean of each frame takes one of its pixels' degrees of freedom, to first order
-    expected = away.var(axis=0, ddof=1).mean() * (1.0 + 1.0 / stack[0].size)
-    assert repeats.variance_dn2 == pytest.approx(expected, rel=1e-10)

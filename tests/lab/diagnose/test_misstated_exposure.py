@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
 from lab.diagnose.inference.held_out import held_out_mismatches
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.outlying import freed, outlying_levels
@@ -18,7 +19,6 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.observables.darks.level import measure_dark
 from lab.observables.flats.linearity import measure_photon_transfer
-from mocks.former import ConcealedCamera, Plan
 from tests.lab.diagnose.on_blocks import measured_model, verdict
 
 DARKS = 9

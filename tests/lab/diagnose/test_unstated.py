@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
 from lab.diagnose import diagnose
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.side_model import measurement_model
@@ -18,7 +19,6 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.dataset import Dataset
-from mocks.former import ConcealedCamera, Plan
 
 
 @cache

@@ -135,3 +135,11 @@ def test_the_command_writes_a_file_a_sample_and_table(tmp_path: Path, capsys: py
     ]
     assert "400.0,0.3" in (tmp_path / "o" / "table_2_A1.csv").read_text()
     assert "2 tables with the same samples" in capsys.readouterr().err
+
+
+def test_no_sample_becomes_a_hidden_file(tmp_path: Path) -> None:
+    (tmp_path / "m.txt").write_text(table((("1", "../../x", "0.2"), ("2", ".y", "0.9"))))
+    assert cli.main(["import", str(tmp_path / "m.txt"), "--from", "spectra", "--out", str(tmp_path / "o" / "p")]) == 0
+    files = list(tmp_path.rglob("*.csv"))
+    assert sorted(file.name for file in files) == ["___.._x.csv", "_y.csv"]
+    assert {file.parent for file in files} == {tmp_path / "o" / "p"}

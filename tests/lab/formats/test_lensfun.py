@@ -296,6 +296,26 @@ def test_coefficients_are_interpolated_over_focal_length(tmp_path: Path) -> None
     np.testing.assert_allclose(lens.distortion(r * half_mm), a * r**3 + b * r**2 + c * r + 1.0 - a - b - c, rtol=1e-12)
 
 
+@pytest.mark.parametrize(("first", "last"), [(-0.02, -0.05), (-0.05, -0.02)])
+def test_of_several_calibrations_at_one_place_the_last_is_taken_and_it_is_reported(
+    tmp_path: Path, first: float, last: float
+) -> None:
+    """As lensfun 0.3.4 does: its `interpolate_distortion(14)` has the last k1. r_d = r (1 - k1 + k1 r^2)."""
+    line = '<distortion model="poly3" focal="14" k1="{}"/>'
+    file = lens_file(tmp_path, line.format(first) + line.format(last))
+    lens = read_lensfun(file, camera_of().camera)
+    half_mm = 0.5 * FULL_FRAME_MM / 1.622 / math.hypot(1.5, 1.0)
+    assert lens.distortion is not None
+    np.testing.assert_allclose(lens.distortion(np.array([half_mm * 2.0])), 1.0 - last + 4.0 * last, rtol=1e-12)
+    (remark,) = lens.remarks
+    assert remark == (
+        "distortion: several calibrations at 14 mm differ, and the last one is taken, as lensfun does; remove those "
+        "that don't apply"
+    )
+    file = lens_file(tmp_path, line.format(last) + line.format(last))
+    assert read_lensfun(file, camera_of().camera).remarks == ()
+
+
 def test_a_focal_length_next_to_the_calibrated_ones_is_reported(tmp_path: Path) -> None:
     file = lens_file(tmp_path, '<distortion model="poly5" focal="14.5" k1="-0.02"/>')
     assert read_lensfun(file, camera_of().camera).remarks == (

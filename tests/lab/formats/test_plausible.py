@@ -11,16 +11,10 @@ import pytest
 from lab.diagnose import diagnose
 from lab.fit import fit_recording_set
 from lab.formats.camera_file import fitted_camera, read_camera, write_camera
+from lab.formats.plausible_range import OUTSIDE_SIGMA, STATED, Plausible
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, SpectralFit, StereoFit
-from lab.formats.results.plausible import (
-    FIGURES,
-    OUTSIDE_SIGMA,
-    STATED,
-    Plausible,
-    highest_mtf50_cy_per_px,
-    implausible_figures,
-)
+from lab.formats.results.plausible import FIGURES, highest_mtf50_cy_per_px, implausible_figures
 from tests.lab.mono_session import MonoSession
 
 SHEET = DataSheet(rows=480, cols=640, cfa="MONO", bit_depth=12, black_level_dn=100.0)
@@ -128,6 +122,20 @@ def test_a_sharpened_edge_is_above_the_limit_and_one_noisy_edge_of_many_is_not()
     (line,) = warnings_of(sheet, mtf=(edge(0.75),))
     assert "MTF50 Y of e 0.7500" in line and "above the limit of 0.604 cy/px" in line and "may sharpen" in line
     assert not warnings_of(sheet, mtf=(edge(0.5), edge(0.75), edge(0.5)))
+
+
+@pytest.mark.parametrize(("peak", "std", "is_reported"), [(1.05, 0.01, True), (1.03, 0.01, False), (1.0, 0.0, False)])
+def test_a_modulation_above_one_is_reported(peak: float, std: float, is_reported: bool) -> None:
+    """By three standard deviations of noise and of the estimate, 0.5 %: 1 + 3 * 0.0112 = 1.0335."""
+    curve = {
+        "frequency_cy_per_px": (0.0, 0.1, 0.2, 0.6),
+        "mtf": (1.0, peak, 0.7, 1.4),
+        "mtf_std": (0.0, std, 0.01, 0.1),
+    }
+    lines = warnings_of(mtf=(edge(0.3, **curve),))
+    assert len(lines) == is_reported
+    if is_reported:
+        assert lines[0].startswith("left: highest MTF Y of e 1.050 ± 0.011 is above the limit of 1: the camera may")
 
 
 @pytest.mark.parametrize(

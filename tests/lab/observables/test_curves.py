@@ -6,13 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evaluation.independent_simulator import Law
+from evaluation.independent_simulator.laws import StrayLightLaw
 from lab.diagnose.inference.refit import refit
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.observables.spectra.curves import BEYOND_STD, LEAK_STD, CurveJacobian, _last_place
 from lab.observables.spectra.narrowband import measure_narrowband
-from mocks.former import Law
-from mocks.former.laws import StrayLightLaw
 from sim.effects.stray_light import StrayLight
 from sim.spectrum import Spectrum
 from sim.uniform import electron_rate

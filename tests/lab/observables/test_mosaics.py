@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from scipy.special import chdtri, ndtri
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator.laws import ChargeDiffusionLaw, LateralColourLaw, OpticalLowPassFilterLaw
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.observables.dataset import Dataset
 from lab.observables.observable import Observable, measurements
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.laws import ChargeDiffusionLaw, LateralColourLaw, OpticalLowPassFilterLaw
 from sim.effects.base import Effects
 from sim.effects.library import candidates
 from sim.sensor.mosaic import phases

@@ -15,13 +15,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.observables.dataset import Dataset
 from lab.observables.noise.line_spectra import Bands, log_mean_bias, log_mean_variance, periodogram
 from lab.observables.observable import Observable, measurements
-from mocks.former import ConcealedCamera, Plan
 
 #: Probability that a healthy measurement fails a whole test, over all its comparisons (Bonferroni).
 CHANCE = 1e-3

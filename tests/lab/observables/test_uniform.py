@@ -8,32 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
-from lab.diagnose.inference.side_model import measurement_model
-from lab.observables.codes.rounding import rounding_std_dn
-from lab.observables.darks.frames import cell_means
-from lab.observables.darks.level import added_dark_dn, dark_current_map
-from lab.observables.flats.field import measure_flat_field
-from lab.observables.flats.linearity import RADIOMETER_STD, measure_photon_transfer
-from lab.observables.gaussian import chi2
-from lab.observables.noise.figures import (
-    NARROW_WINDOW_PX,
-    WIDE_PLANE_PX,
-    WIDE_WINDOW_PX,
-    level_repeatability,
-    repeated_levels,
-    variance_between_pixels,
-)
-from lab.observables.spectra.light_readings import (
-    MOST_SAMPLE_STD,
-    READING_SAMPLE_STD,
-    READING_STD,
-    reading_std,
-    sample_std,
-)
-from lab.observables.spectra.narrowband import measure_narrowband
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.laws import (
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator.laws import (
     AbsorptionBandLaw,
     CoverGlassFringeLaw,
     ExposureOffsetLaw,
@@ -44,6 +21,22 @@ from mocks.former.laws import (
     StrayLightLaw,
     WavelengthOffsetLaw,
 )
+from lab.diagnose.inference.side_model import measurement_model
+from lab.observables.codes.rounding import rounding_std_dn
+from lab.observables.darks.frames import cell_means
+from lab.observables.darks.level import added_dark_dn, dark_current_map
+from lab.observables.flats.field import measure_flat_field
+from lab.observables.flats.linearity import RADIOMETER_STD, measure_photon_transfer
+from lab.observables.gaussian import chi2
+from lab.observables.noise.repeatability import level_repeatability, repeated_levels
+from lab.observables.spectra.light_readings import (
+    MOST_SAMPLE_STD,
+    READING_SAMPLE_STD,
+    READING_STD,
+    reading_std,
+    sample_std,
+)
+from lab.observables.spectra.narrowband import measure_narrowband
 from sim.effects.amplifier_glow import AmplifierGlow
 from sim.effects.image_lag import ImageLag
 from sim.effects.persistence import Persistence
@@ -251,19 +244,6 @@ def test_a_dark_current_over_the_field_is_that_of_the_pixels() -> None:
     found = cell_means(dark_current_map(at, glow)(None).astype(np.float32))
     expected = cell_means(Uniform(at.camera, glow).dark_e_per_s(None).astype(np.float32))
     np.testing.assert_allclose(found, expected, rtol=1e-4)
-
-
-@pytest.mark.parametrize("side_px", [8, 12, 30])
-def test_response_between_pixels_is_measured_on_small_planes(side_px: int) -> None:
-    """Its variance on a slope of the light, the mean of 200 planes; the box's own pixel is put back."""
-    rng, planes = np.random.default_rng(5), 200
-    slope = np.linspace(0.0, 20.0, side_px)[:, None]
-    found = [
-        variance_between_pixels(1000.0 + slope + 8.0 * rng.standard_normal((side_px, side_px))) for _ in range(planes)
-    ]
-    left = side_px - 2 * (WIDE_WINDOW_PX if side_px >= WIDE_PLANE_PX else NARROW_WINDOW_PX)[1]
-    # 4 sigma; neighbours of one box share it, and the plane's mean takes 1 / left^2 at most
-    assert np.mean(found) == pytest.approx(64.0, rel=4.0 * np.sqrt(2.0 / left**2 / planes) * 1.2 + 1.0 / left**2)
 
 
 @pytest.mark.parametrize("cfa", ["MONO", "RGGB"])

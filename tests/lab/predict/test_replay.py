@@ -6,15 +6,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.challenge.draw import recordings_of
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
 from lab.observables.dataset import Dataset
 from lab.predict.replay import Replay
-from mocks.former import ConcealedCamera, Plan
 from sim.effects.library import effect
 from sim.spectrum import FloatArray
 

@@ -9,7 +9,9 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator import laws as concealed_laws
 from lab.diagnose.outcome.improved_model import IN_CURVES
 from lab.errors import Cancelled
 from lab.fit import fit_recording_set
@@ -19,8 +21,6 @@ from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult, FitResult, Unexplained, ValidationResult
 from lab.predict.validate import baseline_of, predict_both, validate
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former import laws as concealed_laws
 from sim.effects.infrared_cut_filter import InfraredCutFilter
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.point import kernel, optical_transfer

@@ -118,3 +118,30 @@ def test_a_mosaic_of_one_colour_is_a_monochrome_sensor() -> None:
     law = charge_of(CAMERA, (one,)).trails[0]
     np.testing.assert_allclose(found, np.tile(law.otf(0.0 * f, f, 0.5 * (CAMERA.rows + 1)), (3, 1)), atol=1e-9)
     assert np.abs(optical_transfer(camera, "G", LIGHT, 0.0 * f, f, (one,))[-1]) > 0.0
+
+
+@pytest.mark.parametrize("release_px", [0.5, 3.0])
+def test_noise_goes_to_the_next_packet_alone_where_each_fills_the_traps(release_px: float) -> None:
+    """Traps that each packet fills to g of its charge keep g b of it, b = exp(-1 / release), and give the rest back to
+    it. The next one fills them again: N'_i = (1 - g b) N_i + g b N_(i-1), whatever the release. Over N pixels the
+    covariance with the next pixel, over the variance, is g b (1 - g b) / ((1 - g b)^2 + (g b)^2) within 3 / sqrt(N);
+    the library's law is that of the frame's mean number of transfers, to first order."""
+    lost = 0.03
+    g = lost / np.exp(-1.0 / release_px)
+    electrons = np.random.default_rng(4).poisson(1000.0, (200, 2000)).astype(float)
+    held, read = g * np.exp(-1.0 / release_px) * electrons[0], [electrons[0]]
+    for row in electrons[1:]:
+        filled = g * row
+        given = filled * (1.0 - np.exp(-1.0 / release_px))
+        read.append(row - (filled - held) + given)
+        held = filled - given
+    away = np.array(read[1:]) - np.mean(read[1:])
+    beside = float(np.mean(away[1:] * away[:-1]) / np.mean(np.square(away)))
+    assert beside == pytest.approx(lost * (1.0 - lost) / ((1.0 - lost) ** 2 + lost**2), abs=3.0 / np.sqrt(away.size))
+
+    ppm = 1e6 * lost / (0.5 * (CAMERA.rows + 1.0))
+    law = ChargeTransferInefficiency(parallel_ppm=min(ppm, 1000.0), release_px=release_px, noise="to the next packet")
+    mean_lost = 1e-6 * law.parallel_ppm * 0.5 * (CAMERA.rows + 1.0)
+    shared = charge_of(CAMERA, (law,)).neighbour_correlation(np.array(1000.0))
+    assert shared[1] == pytest.approx(mean_lost, rel=2.0 * mean_lost)
+    assert shared[0] == 0.0

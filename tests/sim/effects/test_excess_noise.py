@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 
 from sim.effects.excess_noise import ExcessNoise
 from sim.frame import Exposure, expected_electrons, moments, sample
 from sim.scene.scenes import UniformField
-from sim.sensor.electrons import multiply_electrons
+from sim.sensor.electrons import Multiplication
 from tests.sim.effects.test_sensor_effects import CAMERA, LIGHT
 
 FLAT = Exposure(UniformField(LIGHT), 0.002)
@@ -41,7 +43,7 @@ def test_frames_have_that_noise_and_its_skewness() -> None:
 
 def test_a_single_electron_is_multiplied_exponentially_at_two() -> None:
     """Mean 1, variance 1, and exp(-1) of them above 1; N = 200,000."""
-    drawn = multiply_electrons(np.ones(200_000, np.float32), 2.0, np.random.default_rng(6))
+    drawn = Multiplication(2.0).draw(np.ones(200_000, np.float32), np.random.default_rng(6))
     assert drawn.mean() == pytest.approx(1.0, abs=4.0 / np.sqrt(2e5))
     assert np.mean(drawn > 1.0) == pytest.approx(np.exp(-1.0), abs=4.0 * 0.48 / np.sqrt(2e5))
 
@@ -53,3 +55,21 @@ def test_a_registers_gain_setting_is_that_of_the_law() -> None:
     assert register.factor(20.0 * np.log10(2.0)) == pytest.approx(1.75)
     assert register.factor(-20.0 * np.log10(2.0)) == pytest.approx(1.0)
     assert ExcessNoise(excess_percent=50.0).factor(12.0) == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize("distribution", ["geometric", "gamma"])
+def test_either_distribution_has_its_moments(distribution: Literal["geometric", "gamma"]) -> None:
+    """Of N = 200,000 single electrons at F^2 = 1.5: mean 1, variance 0.5, E g^3 = 1.5^2 x skewness, 3 of a gamma and
+    3.25 of a geometric number (M = 2: E n (n + 1)(n + 2) = 6 M^3, by which E n^3 = 26, over 2^3). The standard
+    deviation of the mean cube is sqrt(E g^6 / N), E g^6 below 150 of both."""
+    law = Multiplication(1.5, distribution)
+    drawn = law.draw(np.ones(200_000, np.float32), np.random.default_rng(7)).astype(float)
+    assert drawn.mean() == pytest.approx(1.0, abs=4.0 * np.sqrt(0.5 / 2e5))
+    third = {"geometric": 3.25, "gamma": 3.0}[distribution]
+    assert 1.5**2 * law.skewness == pytest.approx(third, rel=1e-12)
+    assert np.mean(drawn**3) == pytest.approx(third, abs=4.0 * np.sqrt(150.0 / 2e5))
+
+
+def test_without_multiplication_nothing_is_skewed() -> None:
+    assert Multiplication().skewness == 1.0
+    assert Multiplication(1.0, "gamma").skewness == 1.0

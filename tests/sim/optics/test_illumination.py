@@ -8,14 +8,8 @@ from pydantic import ValidationError
 
 from sim.camera import CameraModel, Geometry
 from sim.frame import Exposure, expected_electrons
-from sim.optics.illumination import (
-    MeasuredIllumination,
-    RadialIllumination,
-    irradiance_factor,
-    optical_axis_px,
-    relative_illumination,
-    sin_theta,
-)
+from sim.optics.fall_off import MeasuredIllumination, RadialIllumination
+from sim.optics.illumination import irradiance_factor, optical_axis_px, relative_illumination, sin_theta
 from sim.parameters import Frozen
 from sim.scene.scenes import UniformField
 from sim.spectrum import Spectrum

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
 from lab.diagnose import examine
 from lab.diagnose.inference.bootstrap import HealthyDraw, image_threshold
 from lab.diagnose.side import diagnose_side
-from mocks.former import ConcealedCamera, Plan
 
 
 def test_a_threshold_of_few_draws_is_that_of_many() -> None:

@@ -11,7 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.challenge.draw import DrawnFrame, recordings_of
+from evaluation.draw import DrawnFrame, recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator.laws import (
+    AdcNonlinearityLaw,
+    AmplifierGlowLaw,
+    BlackLevelDriftLaw,
+    CrosstalkLaw,
+    DarkCurrentTemperatureLaw,
+    HotPixelsLaw,
+    InfraredCutFilterLaw,
+    StrayLightLaw,
+)
 from lab.diagnose import diagnose
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.metadata.frames import misstated_dark_exposure, misstated_exposure_unit
@@ -22,17 +33,6 @@ from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.importers import read_checkerboard_pairs
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.recording_set import InstrumentSnapshot, Manifest, RecordingSet, inspect
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.laws import (
-    AdcNonlinearityLaw,
-    AmplifierGlowLaw,
-    BlackLevelDriftLaw,
-    CrosstalkLaw,
-    DarkCurrentTemperatureLaw,
-    HotPixelsLaw,
-    InfraredCutFilterLaw,
-    StrayLightLaw,
-)
 from tests.lab.diagnose.metadata.lies import restated, told, with_cells, with_dark_exposures, with_exchanged_wavelengths
 from tests.lab.diagnose.on_blocks import former
 from tests.lab.fit.noise.synthetic_sensor import Sensor, recording_set

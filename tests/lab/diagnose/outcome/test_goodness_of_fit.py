@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from evaluation.independent_simulator.laws import RowNoiseLaw
 from lab.diagnose import diagnose
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
@@ -31,7 +32,6 @@ from lab.observables.flats.linearity import measure_photon_transfer
 from lab.observables.observable import Prediction
 from lab.observables.spectra.narrowband import measure_narrowband
 from lab.report.diagnosis import _visibility
-from mocks.former.laws import RowNoiseLaw
 from sim.effects.amplifier_glow import AmplifierGlow
 from sim.effects.defocus import Defocus
 from sim.effects.infrared_cut_filter import InfraredCutFilter

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
+from evaluation.independent_simulator import laws as concealed_laws
 from lab.diagnose import Diagnosis, examine
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
 from lab.diagnose.inference.measurement_model import MeasurementModel, form_name
@@ -21,8 +23,6 @@ from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.gaussian import chi2
 from lab.observables.observable import Label, Observable, Prediction
 from lab.predict.simulate import SimulateOptions, simulate
-from mocks.former import ConcealedCamera, Plan
-from mocks.former import laws as concealed_laws
 from sim.effects.base import Effect
 from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter

@@ -9,7 +9,8 @@ import numpy as np
 from lab.fit.noise.noise_fit import noise_fit
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import NoiseFit
-from lab.observables.noise.levels import MeasuredLevel, level_statistics
+from lab.observables.noise.levels import MeasuredLevel
+from lab.observables.noise.stack import level_statistics
 from sim.sensor.mosaic import planes
 
 

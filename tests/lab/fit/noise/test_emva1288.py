@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from lab.fit.noise.emva1288 import EmvaInput, emva1288_figures
-from lab.observables.noise.levels import MeasuredLevel, SpatialVariance, level_statistics
+from lab.observables.noise.levels import MeasuredLevel
+from lab.observables.noise.stack import SpatialVariance, level_statistics
 
 GAIN, BLACK, READ, FULL, EFFICIENCY, DARK = 0.4, 60.0, 6.0, 6000.0, 0.5, 40.0
 SHAPE = (60, 80)

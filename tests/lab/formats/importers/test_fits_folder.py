@@ -208,6 +208,9 @@ def test_exposures_of_no_clear_unit_are_problems(
             -10.0,
             "263.15 is in kelvin by its comment: read as -10 degree C",
         ),
+        (("CCD-TEMP", 14.0, "[F] sensor"), -10.0, "14 is in degree F by its comment: read as -10 degree C"),
+        (("CCD-TEMP", 14.0, "deg F"), -10.0, "14 is in degree F by its comment: read as -10 degree C"),
+        (("CCD-TEMP", 14.0, "Filter housing"), 14.0, ""),
         (("TEMPERAT", -999.0, ""), None, "TEMPERAT = -999 is outside"),
         (("SET-TEMP", -20.0, ""), -20.0, "no measured temperature: the set point SET-TEMP = -20 degree C is used"),
         (("TEMP", "-65 C", ""), -65.0, ""),
@@ -426,3 +429,18 @@ def test_frames_that_are_made_of_several_are_no_frames(tmp_path: Path) -> None:
     (tmp_path / "index.csv").write_text("frame,kind\na.fits,dark\nb.fits,dark\n")
     with pytest.raises(RecordingError, match=r"b.fits: NCOMBINE = 20: made of several frames, whose noise isn't one"):
         read_fits_folder(tmp_path)
+
+
+def test_a_line_for_many_files_says_where_their_values_differ(tmp_path: Path) -> None:
+    for k, set_point in enumerate((-10.0, -10.0, -20.0)):
+        hdu = fits.PrimaryHDU(np.full((24, 32), 1000 + k, np.uint16))
+        hdu.header.update({"IMAGETYP": "Bias Frame", "EXPTIME": 0.0, "SET-TEMP": set_point})
+        hdu.writeto(tmp_path / f"b{k}.fits")
+    (tmp_path / "camera.toml").write_text('cfa = "MONO"\nbit_depth = 16\n')
+    recordings = read_fits_folder(tmp_path)
+    assert [capture.temperature_c for capture in recordings.captures()] == [-10.0, -10.0, -20.0]
+    assert any(
+        "b0.fits and 2 more: no measured temperature: the set point SET-TEMP = -10 degree C is used (others have other "
+        "values)" in line
+        for line in recordings.warnings
+    )

@@ -199,6 +199,46 @@ def test_boards_at_other_gains_are_a_warning_and_at_other_binnings_refused(tmp_p
         read_foreign("checkerboard", tmp_path, options)
 
 
+@pytest.mark.parametrize(
+    ("key", "values", "warns"),
+    [
+        ("HSPEED", (1.0, 5.0), True),
+        ("CMOSGAIN", (0, 120), True),
+        ("FILTNAM", ("g", "r"), True),
+        ("WINDSPED", (1.0, 5.0), False),
+        ("AIRMASS", (1.0, 5.0), False),
+    ],
+)
+def test_a_keyword_that_is_not_listed_but_seems_a_setting_is_a_warning(
+    tmp_path: Path, key: str, values: tuple[object, object], warns: bool
+) -> None:
+    rng = np.random.default_rng(5)
+    for k in range(4):
+        head = {key: values[k // 2], "EXPTIME": 1.0 + k // 2, "IMAGETYP": "FLAT"}
+        _write(tmp_path / f"flat{k}.fits", rng, 9000.0, 0.5, head)
+    (tmp_path / "camera.toml").write_text('cfa = "MONO"\nbit_depth = 16\n')
+    lines = [line for line in read_fits_folder(tmp_path).warnings if key in line]
+    assert len(lines) == warns
+    if warns:
+        assert (
+            f"{key} differs between frames that are fitted together: {values[0]:} in 2 frames".replace(".0", "")
+            in (lines[0])
+        )
+        one = f"{key}={values[0]}"
+        kept = read_foreign("fits", tmp_path, ImportOptions(only=one))
+        assert len(kept.captures()) == 2 and not any("differs" in line for line in kept.warnings)
+        read = read_foreign("fits", tmp_path, ImportOptions(ignore=key))
+        assert len(read.captures()) == 4 and not any("differs" in line for line in read.warnings)
+
+
+def test_a_measurement_of_each_frame_is_no_setting(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    for k in range(3):
+        _write(tmp_path / f"f{k}.fits", rng, 9000.0, 0.5, {"GAINMEAS": 0.5 + 0.01 * k, "EXPTIME": 1.0, "FRAME": "flat"})
+    (tmp_path / "camera.toml").write_text('cfa = "MONO"\nbit_depth = 16\n')
+    assert not any("GAINMEAS" in line for line in read_fits_folder(tmp_path).warnings)
+
+
 def test_the_list_is_declared_once() -> None:
     assert len(KEYWORDS) == sum(len(setting.keywords) for setting in SETTINGS)
     assert all(setting.factor >= 1.0 for setting in SETTINGS)

@@ -202,6 +202,26 @@ def test_a_mosaic_that_the_file_contradicts_is_refused(tmp_path: Path, own: Cfa,
     )
 
 
+@pytest.mark.parametrize(("pattern", "own"), [(b"\x01\x02\x00\x01", "GBRG"), (b"\x02\x01\x01\x00", "BGGR")])
+def test_a_tiffs_own_mosaic_is_compared(tmp_path: Path, pattern: bytes, own: str) -> None:
+    """CFARepeatPatternDim and CFAPattern of TIFF/EP, colours by number: R 0, G 1, B 2."""
+
+    def write(dim: tuple[int, int], colours: bytes) -> None:
+        tags = [(33421, SHORT, 2, dim, True), (33422, 1, len(colours), colours, True)]
+        tifffile.imwrite(tmp_path / "a.tif", noise(), photometric="cfa", metadata=None, extratags=tags)
+
+    write((2, 2), pattern)
+    (tmp_path / "index.csv").write_text("frame,kind,exposure_s\na.tif,dark,0.01\n")
+    (tmp_path / "camera.toml").write_text('cfa = "RGGB"\nbit_depth = 12\n')
+    with pytest.raises(InputError, match=f"cfa = RGGB is stated, but the file's own mosaic is {own}"):
+        read_foreign("raw-folder", tmp_path)
+    (tmp_path / "camera.toml").write_text("bit_depth = 12\n")
+    assert read_foreign("raw-folder", tmp_path).camera("left").cfa == own
+    write((6, 6), bytes([1, 1, 0, 1, 1, 2] * 6))
+    with pytest.raises(InputError, match="has a mosaic of 6 x 6 pixels in the colours GRB, not one of RGGB"):
+        read_foreign("raw-folder", tmp_path)
+
+
 @pytest.mark.parametrize("own", ["RGGB", "GBRG", "MONO"])
 def test_a_raw_states_what_camera_toml_leaves_out(tmp_path: Path, own: Cfa) -> None:
     raw(tmp_path / "a.dng", own, black=72.0)

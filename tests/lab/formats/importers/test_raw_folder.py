@@ -97,6 +97,15 @@ def test_manifest_rules_hold_for_rows_too(folder: Path) -> None:
     assert "exposure_s" in exposure
 
 
+@pytest.mark.parametrize(("stated_c", "words"), [(77.0, "a temperature in kelvin"), (60.0, ""), (-196.0, "")])
+def test_temperatures_that_may_be_in_kelvin_are_asked_about(folder: Path, stated_c: float, words: str) -> None:
+    """77 K is liquid nitrogen; silicon works at 60 degree C, and at -196."""
+    (folder / "index.csv").write_text(f"frame,kind,side,exposure_s,temperature_c\ndark.png,dark,left,0.1,{stated_c}\n")
+    recordings = read_raw_folder(folder)
+    told = [line for line in recording.inspect(recordings)[1] if "temperature_c" in line]
+    assert len(told) == bool(words) and all(words in line for line in told)
+
+
 def test_index_or_camera_file_missing_or_useless(folder: Path) -> None:
     text = (folder / "index.csv").read_text()
     for content, word in (
@@ -233,6 +242,9 @@ def test_an_empty_folder(tmp_path: Path, kind: str) -> None:
 def test_a_file_for_a_folder_and_the_other_way(folder: Path) -> None:
     with pytest.raises(InputError, match=r"dark\.png: is a file; give the folder that it is in"):
         read_foreign("raw-folder", folder / "dark.png")
+    (folder / "mine.tar.gz").write_bytes(b"")
+    with pytest.raises(InputError, match=r"mine\.tar\.gz: is a file; unpack it, and give the folder"):
+        read_foreign("raw-folder", folder / "mine.tar.gz")
     with pytest.raises(InputError, match="in: is a folder; give one picture"):
         read_foreign("slanted-edge", folder)
 

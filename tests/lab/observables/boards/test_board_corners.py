@@ -9,9 +9,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from evaluation.draw import recordings_of, recordings_of_pair
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator import laws as concealed
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.charuco import CharucoCapture
-from lab.challenge.draw import recordings_of, recordings_of_pair
 from lab.fit.geometry import fit_geometry
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
@@ -21,8 +23,6 @@ from lab.observables.boards.lateral_colour import measure_board_colour
 from lab.observables.boards.residuals import CellResiduals, cell_residuals, measure_boards
 from lab.observables.boards.views import BoardView
 from lab.observables.dataset import Dataset
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former import laws as concealed
 from sim.camera import Geometry
 from sim.effects.library import effect as library_effect
 from tests.lab.fit.geometry.test_bundle_adjustment import AT_EIGHT, rippled

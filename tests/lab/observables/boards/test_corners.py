@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from lab.challenge.draw import recordings_of, recordings_of_pair
+from evaluation.draw import recordings_of, recordings_of_pair
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator import laws as concealed
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
@@ -24,8 +26,6 @@ from lab.observables.boards.pair_gain import measure_stereo_gain
 from lab.observables.boards.pair_time import measure_stereo_time
 from lab.observables.boards.residuals import measure_boards
 from lab.observables.dataset import Dataset
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former import laws as concealed
 from sim.camera import Geometry, Side
 from tests.lab.diagnose import on_blocks
 

@@ -8,7 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator.laws import AdcNonlinearityLaw, DigitalGainLaw, LossyCodesLaw
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
@@ -20,8 +22,6 @@ from lab.observables.darks.level import measure_dark
 from lab.observables.dataset import Dataset
 from lab.observables.flats.linearity import measure_photon_transfer
 from lab.observables.flats.noise import measure_noise
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.laws import AdcNonlinearityLaw, DigitalGainLaw, LossyCodesLaw
 from sim.effects.adc_ripple import AdcRipple
 from sim.effects.bit_weights import BitWeights
 from sim.effects.library import effect

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan, laws
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.side_model import measurement_model
@@ -27,7 +28,6 @@ from lab.observables.darks.readout import measure_dark_correlation, measure_fixe
 from lab.observables.dataset import Dataset
 from lab.observables.gaussian import chi2
 from lab.observables.observable import Observable, measurements
-from mocks.former import ConcealedCamera, Law, Plan, laws
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.library import effect

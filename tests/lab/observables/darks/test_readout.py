@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
+from evaluation.independent_simulator.laws import TapOffsetLaw
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.darks.readout import DarkReadOut
-from lab.observables.flats.field import measure_flat_lines
-from lab.observables.flats.linearity import measure_level_repeats
+from lab.observables.flats.level_repeats import measure_level_repeats
+from lab.observables.flats.lines import measure_flat_lines
 from lab.observables.flats.rows import measure_flat_rows
-from mocks.former import ConcealedCamera, Plan
-from mocks.former.laws import TapOffsetLaw
 from sim.camera import Shutter
 from sim.effects.light_flicker import LightFlicker
 from sim.spectrum import FloatArray

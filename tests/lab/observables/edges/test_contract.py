@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_triangular
 
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.challenge.draw import recordings_of
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
@@ -25,7 +26,6 @@ from lab.observables.edges.profile import summarise_edge
 from lab.observables.edges.side import SideEdge
 from lab.observables.edges.slanted_edge import measure_slanted_edge
 from lab.observables.gaussian import chi2
-from mocks.former import ConcealedCamera, Plan
 from sim.camera import CameraModel
 from sim.frame import Exposure, dark_electrons, expected_electrons, read_out
 from sim.scene.scenes import EdgeRegion, KnifeEdge

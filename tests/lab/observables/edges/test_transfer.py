@@ -8,8 +8,10 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator import laws as concealed
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.challenge.draw import recordings_of
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
@@ -21,8 +23,6 @@ from lab.observables.edges.slanted_edge import ASIDE, measure_slanted_edge, meas
 from lab.observables.edges.transfer import REAL_AT
 from lab.observables.gaussian import chi2
 from lab.observables.observable import Observable
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former import laws as concealed
 from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.effects.library import effect

@@ -8,6 +8,14 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
+from evaluation.independent_simulator.laws import (
+    DustShadowLaw,
+    MicrolensAngleLaw,
+    NonUniformIlluminationLaw,
+    TapGainLaw,
+    VignettingDecentreLaw,
+    VignettingLaw,
+)
 from lab.formats.recording_set import RecordingSet
 from lab.observables.darks.field import measure_dark_field
 from lab.observables.darks.level import measure_dark
@@ -25,14 +33,6 @@ from lab.observables.flats.green_balance import measure_green_balance
 from lab.observables.flats.linearity import measure_photon_transfer
 from lab.observables.flats.rows import measure_flat_rows
 from lab.observables.observable import Observable
-from mocks.former.laws import (
-    DustShadowLaw,
-    MicrolensAngleLaw,
-    NonUniformIlluminationLaw,
-    TapGainLaw,
-    VignettingDecentreLaw,
-    VignettingLaw,
-)
 from tests.lab.diagnose.on_blocks import dataset, former, measured_model, names, rendered, sigmas, verdict
 from tests.sim.local_effects import ReadOutRamp
 

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evaluation.independent_simulator.laws import LightFlickerLaw, PeriodicBandingLaw, RowNoiseLaw
 from lab.errors import NotDetermined
 from lab.observables.flats.field import measure_flat_field
 from lab.observables.flats.linearity import measure_photon_transfer
 from lab.observables.flats.rows import measure_flat_rows
-from mocks.former.laws import LightFlickerLaw, PeriodicBandingLaw, RowNoiseLaw
 from sim.effects.light_flicker import LightFlicker
 from tests.lab.diagnose.on_blocks import dataset, former, measured_model, names, rendered, sigmas, verdict
 

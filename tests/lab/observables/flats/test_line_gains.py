@@ -5,14 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evaluation.independent_simulator import ConcealedCamera
+from evaluation.independent_simulator.laws import (
+    ColumnNoiseLaw,
+    LineGainLaw,
+    OnChipSmoothingLaw,
+    PhaseDetectionRowsLaw,
+    TapGainLaw,
+)
 from lab.errors import NotDetermined
 from lab.observables.flats import line_gains
 from lab.observables.flats.field import measure_flat_field
 from lab.observables.flats.green_balance import measure_green_balance
 from lab.observables.flats.line_gains import measure_line_gains
 from lab.observables.observable import Observable
-from mocks.former import ConcealedCamera
-from mocks.former.laws import ColumnNoiseLaw, LineGainLaw, OnChipSmoothingLaw, PhaseDetectionRowsLaw, TapGainLaw
 from sim.effects.base import Effect
 from sim.effects.library import effect
 from tests.lab.diagnose.on_blocks import dataset, former, measured_model, sigmas

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evaluation.independent_simulator.laws import ImageLagLaw, LightFlickerLaw, SourceInstabilityLaw
 from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
-from lab.observables.flats.linearity import measure_level_repeats
-from lab.observables.noise.figures import RepeatedMeans, level_repeatability, steady
+from lab.observables.flats.level_repeats import measure_level_repeats
+from lab.observables.noise.repeatability import RepeatedMeans, level_repeatability, steady
 from lab.observables.observable import Observable
-from mocks.former.laws import ImageLagLaw, LightFlickerLaw, SourceInstabilityLaw
 from sim.effects.base import Effects
 from sim.effects.image_lag import ImageLag
 from sim.effects.light_flicker import LightFlicker
@@ -56,11 +56,9 @@ def test_the_scatter_is_true_and_healthy_settings_count() -> None:
     rng = np.random.default_rng(2)
     draws = [_drawn(rng) for _ in range(300)]
     assert sum(len(steady(d)) < len(d) for d in draws) <= 3
-    # the trend takes one of 20 degrees of freedom, and with it 5 % of the whole variance
     whole = SCATTER**2 + NOISE**2
-    expected = 0.95 * whole - NOISE**2
     found = np.mean([level_repeatability(d) ** 2 for d in draws])
-    assert found == pytest.approx(expected, abs=3.0 * whole * np.sqrt(2.0 / (20 * 300)))
+    assert found == pytest.approx(SCATTER**2, abs=3.0 * whole * np.sqrt(2.0 / (20 * 300)))
 
 
 def test_an_unsteady_light_is_no_outlier() -> None:

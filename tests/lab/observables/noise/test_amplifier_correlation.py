@@ -5,10 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evaluation.independent_simulator import Law
+from evaluation.independent_simulator.laws import (
+    AmplifierCrosstalkLaw,
+    ColumnNoiseLaw,
+    OnChipSmoothingLaw,
+    PinkNoiseLaw,
+    RowNoiseLaw,
+)
 from lab.errors import NotDetermined
 from lab.observables.noise.amplifier_correlation import RELATIONS, measure_amplifier_correlation
-from mocks.former import Law
-from mocks.former.laws import AmplifierCrosstalkLaw, ColumnNoiseLaw, OnChipSmoothingLaw, PinkNoiseLaw, RowNoiseLaw
 from sim.effects.base import Effect
 from sim.effects.library import effect
 from tests.lab.diagnose.on_blocks import dataset, former, measured_model, sigmas

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.observables.darks.pixels import DarkPixels, read_noise_distribution
-from lab.observables.noise.levels import Stack, defective_pixels, level_statistics, shading
+from lab.observables.darks.pixels import DarkPixels
+from lab.observables.noise.stack import Stack, level_statistics
+from lab.observables.noise.surface import defective_pixels, shading
 from lab.observables.weighted_lines import dark_line, linearity
+from sim.camera import Cfa
 
 
 def test_statistics_agree_with_their_definitions() -> None:
@@ -73,7 +75,7 @@ def spread_of(read_dn: np.ndarray, repeats: int) -> DarkPixels:
 
 
 def test_pixels_that_are_alike_have_no_spread() -> None:
-    found = read_noise_distribution(spread_of(np.full((120, 160), 3.0), 4), 0.5)
+    found = spread_of(np.full((120, 160), 3.0), 4).figures().at_gain(0.5).noise
     assert found is not None
     assert found.rms_e == pytest.approx(6.0, rel=0.01)  # sigma / sqrt(2 x 3 x 19200) = 0.3 %, three of these
     assert found.spread_percent <= 2.0 * found.spread_percent_std
@@ -85,7 +87,7 @@ def test_the_spread_of_read_noise_is_told_from_the_few_repeats_own() -> None:
     rng = np.random.default_rng(3)
     variance = 9.0 * np.clip(1.0 + 0.25 * rng.standard_normal((120, 160)), 0.1, None)
     variance[3, 4] = 2500.0
-    found = read_noise_distribution(spread_of(np.sqrt(variance), 6), 0.5)
+    found = spread_of(np.sqrt(variance), 6).figures().at_gain(0.5).noise
     assert found is not None
     assert abs(found.spread_percent - 25.0) < 3.5 * found.spread_percent_std
     assert found.noisy_pixels >= 1
@@ -143,3 +145,20 @@ def test_the_linearity_errors_uncertainty_holds_what_noise_adds(
         # differ by a sixth
         stated = np.sqrt(np.mean([each.error_noise_percent**2 for each in found]))
         assert stated == pytest.approx(error.std(), rel=1 / 6 + 3.0 / np.sqrt(2 * draws))
+
+
+@pytest.mark.parametrize("cfa", ["MONO", "GBRG"])
+def test_what_pixels_of_a_row_share_is_told_from_their_own_noise(cfa: Cfa) -> None:
+    """Noise of 3 DN of single pixels and of 1 DN of rows, 6 repeats: of each plane 5 contrasts of r rows, whose
+    variance is known to sqrt(2 / (5 r)); three of these."""
+    rng, rows = np.random.default_rng(8), 160
+    stack = Stack(cfa, 4095, None)
+    for _ in range(6):
+        noise = 3.0 * rng.standard_normal((rows, 200)) + rng.standard_normal((rows, 1))
+        stack.add(np.rint(500.0 + noise).astype(np.uint16))
+    planes = stack.statistics()
+    for plane in planes.values():
+        assert plane.row_variance == pytest.approx(1.0, rel=3.0 * np.sqrt(2.0 / (5 * plane.shape[0])) * 1.1)
+        # one of 12 of a code by rounding
+        own = plane.temporal_variance - plane.row_variance
+        assert own == pytest.approx(9.0 + 1.0 / 12.0, rel=3.0 * np.sqrt(2.0 / (5 * plane.pixels)))

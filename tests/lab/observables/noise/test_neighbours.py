@@ -7,7 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator.laws import (
+    AnisotropicBrighterFatterLaw,
+    BrighterFatterLaw,
+    ColouredReadNoiseLaw,
+    InterPixelCapacitanceLaw,
+    OnChipSharpeningLaw,
+    OnChipSmoothingLaw,
+)
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import refit
@@ -21,16 +30,7 @@ from lab.observables.flats.noise import measure_noise
 from lab.observables.noise.neighbours import correlations, measure_noise_neighbours, measure_noise_tones
 from lab.observables.noise.temporal import PAIRS, independent_correlations, repeats_of
 from lab.observables.observable import Observable
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.laws import (
-    AnisotropicBrighterFatterLaw,
-    BrighterFatterLaw,
-    ColouredReadNoiseLaw,
-    InterPixelCapacitanceLaw,
-    OnChipSharpeningLaw,
-    OnChipSmoothingLaw,
-)
-from sim.camera import CameraModel, Lens
+from sim.camera import CameraModel, Cfa, Lens
 from sim.effects.base import Effect
 from sim.effects.brighter_fatter import BrighterFatter
 from sim.effects.library import effect
@@ -106,6 +106,18 @@ def _blocks(dataset: Dataset) -> tuple[Observable, ...]:
 
 def _verdict(dataset: Dataset) -> Verdict:
     return decide(MeasurementModel(_blocks(dataset), dataset.camera), np.random.default_rng(0), DecisionPolicy())
+
+
+@pytest.mark.parametrize("cfa", ["MONO", "GBRG"])
+def test_independent_pixels_have_the_correlations_of_a_vanishing_exchange(cfa: Cfa) -> None:
+    """A filter of one tap, and shares of neighbours below the rounding of doubles, are none."""
+    planes = ["all"] if cfa == "MONO" else ["R", "G1", "G2", "B"]
+    shot, share = np.linspace(50.0, 400.0, len(planes)), np.zeros((5, len(planes)))
+    read = np.array([-0.03, 1.0, -0.03])
+    closed = correlations(cfa, planes, shot, share, 9.0, 0.1, None, read)
+    summed = correlations(cfa, planes, shot, share + 1e-300, 9.0, 0.1, np.ones((1, 1)), read)
+    np.testing.assert_allclose(closed, summed, atol=1e-14)
+    assert closed[list(PAIRS).index("next in the row")] < 0.0
 
 
 def test_correlations_of_a_filter_are_its_autocorrelation() -> None:

@@ -8,7 +8,16 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator.laws import (
+    ColumnNoiseLaw,
+    CrosstalkLaw,
+    GreenImbalanceLaw,
+    LightFlickerLaw,
+    TapGainLaw,
+    VignettingLaw,
+)
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
@@ -17,19 +26,11 @@ from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.observables.dataset import Dataset
 from lab.observables.flats import green_balance
-from lab.observables.flats.field import flats, measure_flat_lines
 from lab.observables.flats.green_balance import measure_green_balance
+from lab.observables.flats.images import flats
+from lab.observables.flats.lines import measure_flat_lines
 from lab.observables.observable import Observable
 from lab.observables.spectra.narrowband import measure_narrowband
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.laws import (
-    ColumnNoiseLaw,
-    CrosstalkLaw,
-    GreenImbalanceLaw,
-    LightFlickerLaw,
-    TapGainLaw,
-    VignettingLaw,
-)
 
 
 def _dataset(seed: int, laws: Sequence[Law] = (), cfa: str = "RGGB") -> Dataset:

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator import laws as concealed
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import refit
@@ -34,8 +36,6 @@ from lab.observables.screens.lateral_colour import measure_lateral_colour
 from lab.observables.screens.patterns import patterns
 from lab.observables.screens.pixel_grid import measure_screen_grid
 from lab.observables.surroundings import Surroundings, harmonics
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former import laws as concealed
 from sim.effects.charge_diffusion import ChargeDiffusion
 from sim.effects.defocus import Defocus
 from sim.effects.ghost import Ghost

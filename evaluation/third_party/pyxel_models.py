@@ -1,0 +1,263 @@
+"""Sensors by Pyxel (package `pyxel-sim`): T. Prod'homme et al., Pyxel: a novel and multi-purpose Python-based framework
+for imaging detector simulation, JATIS 8 (2022) 048002.
+
+Shot noise, read noise, gain and rounding are numpy's; the effect is Pyxel's own model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from pyxel.detectors import CMOS, Channels, Characteristics, CMOSGeometry, Environment
+from pyxel.detectors.channels import Matrix, ReadoutPosition
+from pyxel.detectors.characteristics import ChargeToVoltSettings
+from pyxel.models.charge_collection.utils_persistence import compute_simple_persistence
+from pyxel.models.charge_generation import avalanche
+from pyxel.models.charge_measurement.alternating_column_noise_cmos import alternating_column_noise_cmos
+from pyxel.models.charge_measurement.inter_pixel_capacitance import ipc_kernel, simple_ipc
+from pyxel.models.charge_measurement.linearity import compute_poly_linearity
+from pyxel.models.charge_measurement.uncorrelated_pink_noise_cmos import uncorrelated_pink_noise_cmos
+from pyxel.models.charge_measurement.utils_amplifier_crosstalk import crosstalk_signal_dc
+from pyxel.models.charge_transfer.utils_cdm import run_cdm_parallel, run_cdm_serial
+
+from evaluation.third_party.camera import DrawnCamera
+from evaluation.third_party.models import SimulatedSensor, SimulatorCheck
+from sim.spectrum import FloatArray
+
+#: Volts an electron, by which Pyxel's signals are read back.
+VOLT_PER_E = 1e-6
+TRANSFER_S, CLOUD_CM3 = 1e-3, 1e-10
+
+
+def _detector(rows: int, cols: int, channels: Channels | None = None) -> CMOS:
+    return CMOS(
+        geometry=CMOSGeometry(
+            row=rows, col=cols, total_thickness=10.0, pixel_vert_size=5.0, pixel_horz_size=5.0, channels=channels
+        ),
+        environment=Environment(temperature=293),
+        characteristics=Characteristics(
+            quantum_efficiency=1.0, charge_to_volt=ChargeToVoltSettings(value=VOLT_PER_E), pre_amplification=1,
+            adc_bit_resolution=12, adc_voltage_range=(0.0, 10.0), full_well_capacity=100000,
+        ),
+    )  # fmt: skip
+
+
+@dataclass
+class PyxelTransfer(SimulatedSensor):
+    """Charge transfer inefficiency by Short's charge distortion model (CDM), one species, a cloud in proportion."""
+
+    axis: int = 0
+    loss: float = 5e-4
+    release_px: float = 1.0
+    full_well_e: float = 1e4
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> PyxelTransfer:
+        axis, loss, release = int(rng.integers(2)), float(rng.uniform(2e-4, 8e-4)), float(rng.uniform(0.6, 3.0))
+        names = ("parallel_ppm", "release_px") if axis == 0 else ("serial_ppm", "serial_release_px")
+        truth = dict(zip(names, (1e6 * loss, release), strict=True))
+        return cls(truth, "hot pixels", axis, loss, release, camera.full_well_e)
+
+    def collect(self, mean_e: FloatArray, exposure_s: float, rng: np.random.Generator) -> FloatArray:
+        return self._clock(rng.poisson(mean_e).astype(float))
+
+    def _clock(self, electrons: FloatArray) -> FloatArray:
+        # with a cloud in proportion to the packet, traps take g N of N electrons a transfer and keep exp(-1 / release)
+        density = self.loss / np.exp(-1.0 / self.release_px) * self.full_well_e / (2.0 * CLOUD_CM3)
+        run = run_cdm_parallel if self.axis == 0 else run_cdm_serial
+        out = run(
+            array=electrons, beta=1.0, vg=CLOUD_CM3, t=TRANSFER_S, fwc=self.full_well_e, vth=1e7,
+            tr=np.array([self.release_px * TRANSFER_S]), nt=np.array([density]), sigma=np.array([1e-6]),
+        )  # fmt: skip
+        return np.asarray(out)
+
+    def check(self) -> SimulatorCheck:
+        """Of one bright pixel after n transfers the traps keep g b / (1 + g) once it has gone on, g = n loss / b: all n
+        transfers act at once in this model, which takes a share g of that from n loss."""
+        frame, n = np.zeros((100, 100)), 60
+        frame[n, n] = 1000.0
+        read = float(self._clock(frame)[n, n]) / 1000.0
+        at_once = n * self.loss / np.exp(-1.0 / self.release_px)
+        return SimulatorCheck(n * self.loss / (1.0 + at_once), 1.0 - read, 1e-6)
+
+
+@dataclass
+class PyxelPersistence(SimulatedSensor):
+    """Simple persistence of one kind of traps without a capacity: in an exposure T they fill or empty by T / tau."""
+
+    share: float = 0.02
+    release_s: float = 20.0
+    trapped: FloatArray | None = None
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> PyxelPersistence:
+        return cls({}, "dark after bright", float(rng.uniform(0.01, 0.05)), float(rng.uniform(10.0, 40.0)))
+
+    def collect(self, mean_e: FloatArray, exposure_s: float, rng: np.random.Generator) -> FloatArray:
+        if self.trapped is None:
+            self.trapped = np.zeros((1, *mean_e.shape))
+        electrons, self.trapped = compute_simple_persistence(
+            pixel_array=rng.poisson(mean_e).astype(float), all_trapped_charge=self.trapped,
+            trap_densities=np.array([self.share]), trap_time_constants=np.array([self.release_s]), delta_t=exposure_s,
+        )  # fmt: skip
+        return np.asarray(electrons)
+
+    def check(self) -> SimulatorCheck:
+        """After a frame of 10,000 e in T the traps hold share T / tau of it, and a dark frame in T gets T / tau of
+        that."""
+        fresh, exposure_s = PyxelPersistence({}, self.plan, self.share, self.release_s), 1.0
+        fresh.collect(np.full((200, 200), 1e4), exposure_s, rng := np.random.default_rng(1))
+        got = float(np.mean(fresh.collect(np.zeros((200, 200)), exposure_s, rng)))
+        asked = 1e4 * self.share * (exposure_s / self.release_s) ** 2
+        return SimulatorCheck(asked, got, 3.0 * asked * 1e-2 / 200.0 + 1e-6)
+
+
+@dataclass
+class Capacitance(SimulatedSensor):
+    """Inter-pixel capacitance of unequal axes, with corners."""
+
+    coupling: float = 0.01
+    corner: float = 0.0
+    unequal: float = 0.0
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> Capacitance:
+        coupling = float(rng.uniform(0.006, 0.02))
+        corner, unequal = coupling * float(rng.uniform(0.0, 0.3)), coupling * float(rng.uniform(-0.4, 0.4))
+        # Pyxel couples more along the row where `unequal` is positive
+        truth = {
+            "share_percent": 100.0 * coupling,
+            "row_excess": unequal / coupling,
+            "corner_share": corner / coupling,
+        }
+        return cls(truth, "usual", coupling, corner, unequal)
+
+    def read(self, electrons: FloatArray, rng: np.random.Generator) -> FloatArray:
+        detector = _detector(*electrons.shape)
+        detector.pixel.array = electrons
+        simple_ipc(detector, self.coupling, self.corner, self.unequal)
+        return np.asarray(detector.signal.array, float) / VOLT_PER_E
+
+    def check(self) -> SimulatorCheck:
+        """The pixel beside a bright one has the coupling in the row; the transform is good to 1e-3 of that."""
+        frame = np.zeros((64, 64))
+        frame[32, 32] = 1e4
+        read = self.read(frame, np.random.default_rng(1))
+        asked = float(ipc_kernel(self.coupling, self.corner, self.unequal)[1, 0])
+        return SimulatorCheck(self.coupling + self.unequal, float(read[32, 33]) / 1e4, 1e-3 * abs(asked) + 1e-6)
+
+
+@dataclass
+class Bend(SimulatedSensor):
+    """A response that bends as a polynomial of the output node's signal."""
+
+    quadratic: float = 0.02
+    full_well_e: float = 1e4
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> Bend:
+        bend = float(rng.uniform(0.015, 0.05)) * float(rng.choice([-1.0, 1.0]))
+        return cls({}, "usual", bend, camera.full_well_e)
+
+    def read(self, electrons: FloatArray, rng: np.random.Generator) -> FloatArray:
+        return np.asarray(compute_poly_linearity(electrons, [0.0, 1.0, self.quadratic / self.full_well_e]))
+
+    def check(self) -> SimulatorCheck:
+        """At half of full well the signal departs by half of the bend."""
+        half = np.full((2, 2), 0.5 * self.full_well_e)
+        departure = float(self.read(half, np.random.default_rng(1))[0, 0] / half[0, 0]) - 1.0
+        return SimulatorCheck(0.5 * self.quadratic, departure, 1e-9)
+
+
+@dataclass
+class PyxelCrosstalk(SimulatedSensor):
+    """DC crosstalk of two amplifiers, each of which reads half of the columns in the same direction."""
+
+    coupling: float = 0.005
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> PyxelCrosstalk:
+        coupling = float(rng.uniform(0.004, 0.012)) * float(rng.choice([-1.0, 1.0]))
+        return cls({"share_percent": 100.0 * coupling}, "usual", coupling)
+
+    def read(self, electrons: FloatArray, rng: np.random.Generator) -> FloatArray:
+        channels = Channels(
+            matrix=Matrix([["left", "right"]]),
+            readout_position=ReadoutPosition({"left": "top-left", "right": "top-left"}),
+        )
+        matrix = np.array([[0.0, self.coupling], [self.coupling, 0.0]])
+        return np.asarray(crosstalk_signal_dc(electrons.copy(), matrix, channels, electrons.shape))
+
+    def check(self) -> SimulatorCheck:
+        """A bright pixel has a ghost at the same place of the other half."""
+        frame = np.zeros((8, 16))
+        frame[3, 2] = 1e4
+        return SimulatorCheck(self.coupling, float(self.read(frame, np.random.default_rng(1))[3, 10]) / 1e4, 1e-9)
+
+
+@dataclass
+class Avalanche(SimulatedSensor):
+    """An avalanche's excess noise: gains of a gamma distribution, codes of the mean electron."""
+
+    excess: float = 1.5
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> Avalanche:
+        excess = float(rng.uniform(1.4, 2.0))
+        return cls({"excess_percent": 100.0 * (excess - 1.0)}, "faint flats", excess)
+
+    def collect(self, mean_e: FloatArray, exposure_s: float, rng: np.random.Generator) -> FloatArray:
+        out: dict[str, FloatArray] = {}
+        electrons = rng.poisson(mean_e).astype(float)
+        mean_gain = SimpleNamespace(avalanche_bias=1.0, bias_to_gain=np.ones_like)
+        detector: Any = SimpleNamespace(
+            pixel=np.zeros(electrons.shape),
+            characteristics=SimpleNamespace(avalanche_settings=mean_gain, charge_to_volt_conversion=0.0),
+            charge=SimpleNamespace(
+                array=electrons, empty=lambda: None, add_charge_array=lambda array: out.update(multiplied=array)
+            ),
+        )
+        avalanche.avalanche_gain(detector, excess_noise_factor=self.excess, seed=int(rng.integers(2**31)))
+        return np.nan_to_num(np.asarray(out["multiplied"]))
+
+    def check(self) -> SimulatorCheck:
+        """The variance over the mean is the factor."""
+        drawn = self.collect(np.full((200, 200), 1000.0), 0.01, np.random.default_rng(1))
+        return SimulatorCheck(
+            self.excess, float(np.var(drawn) / np.mean(drawn)), 3.0 * self.excess * np.sqrt(2.0 / drawn.size)
+        )
+
+
+@dataclass
+class PinkNoise(SimulatedSensor):
+    """Pink noise in reading order, of one amplifier, or of one of even and one of odd columns."""
+
+    std_e: float = 4.0
+    alternating: bool = False
+    detector: Any = field(default=None, repr=False)
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> PinkNoise:
+        alternating = bool(rng.integers(2))
+        std_e = camera.read_noise_e * float(rng.uniform(0.6, 1.5))
+        return cls({}, "usual", std_e, alternating)
+
+    def read(self, electrons: FloatArray, rng: np.random.Generator) -> FloatArray:
+        if self.detector is None:
+            self.detector, seed = _detector(*electrons.shape), int(rng.integers(2**31))
+        else:
+            seed = None
+        self.detector.signal.array = electrons * VOLT_PER_E
+        law = alternating_column_noise_cmos if self.alternating else uncorrelated_pink_noise_cmos
+        law(self.detector, std=self.std_e, seed=seed)
+        return np.asarray(self.detector.signal.array, float) / VOLT_PER_E
+
+    def check(self) -> SimulatorCheck:
+        """The standard deviation over several frames is the one that was asked for; slow waves leave a fifth open."""
+        fresh = PinkNoise({}, "usual", self.std_e, self.alternating)
+        rng = np.random.default_rng(1)
+        drawn = np.array([fresh.read(np.full((96, 128), 1000.0), rng) for _ in range(20)])
+        return SimulatorCheck(self.std_e, float(np.sqrt(np.mean(np.square(drawn - 1000.0)))), 0.2 * self.std_e)

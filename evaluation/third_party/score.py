@@ -1,0 +1,89 @@
+"""The score of third parties' sets: right names, second names, sizes within their uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.effects.library import effect
+
+
+@dataclass(frozen=True)
+class ScoredSize:
+    """A parameter of a rightly named effect, beside the simulator's. `low`, `high`: two standard deviations, or the
+    interval that is reported."""
+
+    name: str
+    truth: float
+    value: float
+    low: float
+    high: float
+
+    @property
+    def is_right(self) -> bool:
+        """Return whether the truth lies in the interval."""
+        return self.low <= self.truth <= self.high
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """One set: what the simulator was asked for and did, the verdict, the names with their probabilities.
+
+    source : name of the simulator's model
+    effect : the library's name of it, None of healthy cameras
+    also : effect that the drawn camera has beside it
+    """
+
+    source: str
+    simulator: str
+    effect: str | None
+    set: int
+    asked: float
+    measured: float
+    is_checked: bool
+    verdict: str
+    names: dict[str, float]
+    sizes: tuple[ScoredSize, ...]
+    cpu_s: float
+    also: str | None = None
+
+    @property
+    def is_named(self) -> bool:
+        """Return whether the effect's or its family's name is among those given."""
+        return self.effect is not None and not {self.effect, effect(self.effect).family}.isdisjoint(self.names)
+
+    @property
+    def right_names(self) -> frozenset[str]:
+        """Return the names that are right: those of the effects and of their families."""
+        concealed = [name for name in (self.effect, self.also) if name is not None]
+        return frozenset(concealed) | {effect(name).family.value for name in concealed}
+
+    @property
+    def second_names(self) -> tuple[str, ...]:
+        """Names that aren't right."""
+        return tuple(name for name in self.names if name not in self.right_names)
+
+
+def table(results: Iterable[Diagnosed]) -> str:
+    """Return the table as Markdown, a row a source."""
+    kept = list(results)
+    lines = [
+        "| simulator | model | sets | check | named | second names | nothing | sizes right | CPU s, median |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for source in dict.fromkeys(one.source for one in kept):
+        own = [one for one in kept if one.source == source]
+        use = [one for one in own if one.is_checked]
+        sizes = [size for one in use for size in one.sizes]
+        named = "-" if own[0].effect is None else str(sum(one.is_named for one in use))
+        seconds = sorted(second for one in use for second in one.second_names)
+        words = ", ".join(f"`{second}` {seconds.count(second)}" for second in dict.fromkeys(seconds)) or "-"
+        right = f"{sum(size.is_right for size in sizes)} of {len(sizes)}" if sizes else "-"
+        cpu_s = f"{np.median([one.cpu_s for one in use]):.0f}" if use else "-"
+        lines.append(
+            f"| {own[0].simulator} | {source} | {len(own)} | {len(use)} of {len(own)} | {named} | {words} | "
+            f"{sum(not one.names for one in use)} | {right} | {cpu_s} |"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,309 @@
+"""The generative model of everything that was measured on one side, and its Gaussian.
+
+    y = m(theta, e_A) + H delta + noise,   noise ~ N(0, S),   theta ~ N(theta_0, P),   delta_g ~ N(0, tau_g^2 K_g)
+
+y       the numbers of all observables, stacked
+m       their prediction by the chain of light, linear in theta about the fit: J theta
+A       the active hypotheses (`hypotheses.py`), each with its parameters u in place of e
+H       changes of m by a disturbance of a state of the chain (`discrepancy.py`); H_g has a factor of K_g in it, so that
+        delta is a vector of independent standard normal numbers times tau_g
+
+Everything but u and tau enters linearly: theta and delta are marginalised in closed form. This module knows nothing of
+cameras: `camera.py` binds it to a recording set, a test to a toy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, eigh
+
+from lab.observables.gaussian import Gaussian
+from sim.spectrum import FloatArray
+
+
+@dataclass(frozen=True)
+class Point:
+    """A hypothesis at given parameters: u (p,), and what the model needs besides to predict it (`template`: an effect
+    with its choices; None in a toy)."""
+
+    u: FloatArray
+    template: Any = None
+
+    def at(self, u: FloatArray) -> Point:
+        """Return the same hypothesis at other parameters."""
+        return replace(self, u=u)
+
+
+#: A set of hypotheses at their parameters, by name.
+State = Mapping[str, Point]
+
+
+class Model(Protocol):
+    """What the search asks of a model."""
+
+    @property
+    def value(self) -> FloatArray:
+        """y, (n,)."""
+
+    @property
+    def groups(self) -> Sequence[Group]:
+        """The groups of small physics that no hypothesis lists."""
+
+    def mean(self, state: State) -> FloatArray:
+        """m under these hypotheses, at the linearisation point of theta, (n,)."""
+
+    def gaussian(self, state: State, form_scale: float) -> Gaussian:
+        """N(m, S + J P J'), with the form errors of the active hypotheses at `form_scale` times their declared
+        tolerance."""
+
+    def has_form_error(self, state: State) -> bool:
+        """Whether any of these hypotheses declares a form tolerance."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """One group of delta: its columns H (n, r) at tau = 1, and its everyday scale s_g, in the same unit.
+
+    `everyday`: tau is half-normal with this standard deviation. Unlisted physics has tau log-uniform from 3 `everyday`
+    to `largest`."""
+
+    name: str
+    columns: FloatArray
+    everyday: float
+    unit: str = "1"
+    source: str = ""
+    largest: float = 1.0
+    held_out: FloatArray | None = None  # the same columns at the held-out numbers, (n*, r)
+
+    def scales(self, unlisted: bool) -> FloatArray:
+        """Return the points of tau at which it is integrated, equally probable a priori: midpoints of equal shares of
+        the prior."""
+        share = (np.arange(SCALES) + 0.5) / SCALES
+        if not unlisted:
+            return np.asarray(self.everyday * _half_normal_quantile(share))
+        low, high = np.log(3.0 * self.everyday), np.log(self.largest)
+        return np.exp(low + share * (high - low))
+
+
+#: Points of tau for every group.
+SCALES = 7
+#: Shares of the declared form tolerances: midpoints of equal shares of a standard half-normal distribution.
+FORM_SHARES = 3
+
+
+def _half_normal_quantile(share: FloatArray) -> FloatArray:
+    from scipy.special import ndtri
+
+    return np.asarray(ndtri(0.5 + 0.5 * share))
+
+
+def form_scales(has_form_error: bool) -> tuple[float, ...]:
+    """Return the equally probable scales of form errors; 0 alone where nothing declares a tolerance."""
+    if not has_form_error:
+        return (0.0,)
+    return tuple(_half_normal_quantile((np.arange(FORM_SHARES) + 0.5) / FORM_SHARES).tolist())
+
+
+def with_columns(gaussian: Gaussian, columns: FloatArray) -> Gaussian:
+    """Return the Gaussian with more independent standard normal coefficients: C + columns columns'."""
+    return replace(gaussian, shared_jacobian=np.column_stack([gaussian.shared_jacobian, columns]))
+
+
+def everyday_scales(groups: Sequence[Group]) -> FloatArray:
+    """Return the median everyday tau of every group, (G,)."""
+    return np.array([g.everyday * _half_normal_quantile(np.array(0.5)) for g in groups])
+
+
+def scaled_columns(groups: Sequence[Group], tau: FloatArray, n: int) -> FloatArray:
+    """Columns of all groups times their tau, (n, R)."""
+    if not groups:
+        return np.zeros((n, 0))
+    return np.column_stack([t * g.columns for g, t in zip(groups, tau, strict=True)])
+
+
+@dataclass(frozen=True)
+class ScaleIntegral:
+    """Marginal likelihood as a function of the scales tau of all groups, the parameters u of the active hypotheses
+    marginalised in the linear problem about their mode.
+
+    In whitened coordinates in which S + J P J' = 1: residual r (n,) at the mode, W = [H, J_u] (n, R + p). The prior of
+    u is normal there, with `precision` (p,) and centre `pull` / precision from the mode:
+
+        log p = 1/2 b' (M + Q)^-1 b - 1/2 log det(1 + Q^-1 M) + const,  M = W'W, b = W'r + pull, Q = diag(1/tau^2,
+        precision)
+    """
+
+    gram: FloatArray
+    projected: FloatArray
+    group_sizes: tuple[int, ...]
+    precision: FloatArray
+    groups: tuple[Group, ...]
+    prior_log: tuple[float, float]  # log prior of u_g = 0 and of u_g = 1, of each group
+    _known: dict[bytes, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        gaussian: Gaussian,
+        residual: FloatArray,
+        groups: Sequence[Group],
+        jacobian: FloatArray,
+        precision: FloatArray,
+        pull: FloatArray,
+        any_unlisted: float,
+    ) -> ScaleIntegral:
+        """From the Gaussian without delta at the mode, the residual there (n,), and the Jacobian by u (n, p)."""
+        columns = np.column_stack([*(g.columns for g in groups), jacobian]) if groups else jacobian
+        white = gaussian.whiten(np.column_stack([columns, residual]))
+        table, r = white[:, :-1], white[:, -1]
+        projected = table.T @ r
+        projected[len(projected) - len(pull) :] += pull
+        one = 1.0 - (1.0 - any_unlisted) ** (1.0 / max(len(groups), 1))
+        return cls(
+            table.T @ table, projected, tuple(g.columns.shape[1] for g in groups), precision, tuple(groups),
+            (float(np.log1p(-one)), float(np.log(one))),
+        )  # fmt: skip
+
+    def log_likelihood(self, tau: FloatArray) -> float:
+        """Log marginal likelihood at these scales (G,), up to a constant of the set."""
+        key = tau.tobytes()
+        if key not in self._known:
+            amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
+            inner = amplitude[:, None] * self.gram * amplitude
+            split = len(amplitude) - len(self.precision)
+            inner[np.diag_indices_from(inner)] += np.concatenate([np.ones(split), self.precision])
+            b = amplitude * self.projected
+            factor = cho_factor(inner, lower=True, check_finite=False)
+            log_det = 2.0 * float(np.log(np.diag(factor[0])).sum())
+            self._known[key] = 0.5 * float(b @ cho_solve(factor, b, check_finite=False)) - 0.5 * log_det
+        return self._known[key]
+
+    def profile(self, g: int, tau: FloatArray, points: FloatArray) -> FloatArray:
+        """Log marginal likelihood at these scales with tau_g at each of `points` (k,)."""
+        return self.profiles(g, tau, points, self.projected[:, None])[:, 0]
+
+    def profiles(self, g: int, tau: FloatArray, points: FloatArray, projected: FloatArray) -> FloatArray:
+        """Return the same (k, m) for m residuals, given their W'r (R + p, m): one factorisation of the others' part,
+        and the eigenvalues of what they leave of group g's (Schur complement)."""
+        amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
+        ends = np.cumsum(self.group_sizes)
+        own = np.zeros(len(amplitude), bool)
+        own[ends[g] - self.group_sizes[g] : ends[g]] = True
+        rest = ~own
+        scale = amplitude[rest]
+        inner = scale[:, None] * self.gram[np.ix_(rest, rest)] * scale
+        inner[np.diag_indices_from(inner)] += np.concatenate(
+            [np.ones(int(rest.sum()) - len(self.precision)), self.precision]
+        )
+        across, b, b_own = (
+            scale[:, None] * self.gram[np.ix_(rest, own)],
+            scale[:, None] * projected[rest],
+            projected[own],
+        )
+        square = self.gram[np.ix_(own, own)]
+        total = np.zeros(projected.shape[1])
+        if len(inner):
+            factor = cho_factor(inner, lower=True, check_finite=False)
+            solved = cho_solve(factor, np.column_stack([across, b]), check_finite=False)
+            left, right = solved[:, : across.shape[1]], solved[:, across.shape[1] :]
+            square, b_own = square - across.T @ left, b_own - across.T @ right
+            total = 0.5 * np.einsum("ij,ij->j", b, right) - float(np.log(np.diag(factor[0])).sum())
+        size, vectors = eigh(square)
+        size, power = np.maximum(size, 0.0), np.square(vectors.T @ b_own)
+        t2 = np.square(points)[:, None]
+        return np.asarray(total + 0.5 * ((t2 / (1.0 + t2 * size)) @ power - np.log1p(t2 * size).sum(1)[:, None]))
+
+    def _swept(self, tau: FloatArray, which: Iterable[int], unlisted: frozenset[int]) -> FloatArray:
+        """Return the scales with each of `which` moved to its likeliest point, the others as they are."""
+        tau = tau.copy()
+        for g in which:
+            points = self.groups[g].scales(g in unlisted)
+            tau[g] = points[int(np.argmax(self.profile(g, tau, points)))]
+        return tau
+
+    def integrated(self, tau: FloatArray, unlisted: frozenset[int]) -> float:
+        """Log marginal likelihood with every tau integrated over its points, by one-dimensional integrals about
+        `tau`, a mode along each coordinate."""
+        at = self.log_likelihood(tau)
+        points = [group.scales(g in unlisted) for g, group in enumerate(self.groups)]
+        return at + sum(_log_mean_exp(self.profile(g, tau, points[g])) - at for g in range(len(points)))
+
+    @cached_property
+    def everyday_mode(self) -> FloatArray:
+        """The likeliest everyday scales (G,)."""
+        tau = everyday_scales(self.groups)
+        for _ in range(2):
+            tau = self._swept(tau, range(len(self.groups)), frozenset())
+        return tau
+
+    @cached_property
+    def everyday(self) -> float:
+        """Log marginal likelihood with all groups everyday."""
+        return self.integrated(self.everyday_mode, frozenset())
+
+    @cached_property
+    def quick(self) -> float:
+        """Log marginal likelihood over no and single flips, the scales of the others as without: a lower bound."""
+        tau, none = self.everyday_mode, frozenset[int]()
+        at, flips, everyday = self.log_likelihood(tau), [], self.log_likelihood(tau)
+        for g, group in enumerate(self.groups):
+            usual, other = group.scales(False), group.scales(True)
+            values = self.profile(g, tau, np.concatenate([usual, other]))
+            usual_log, other_log = _log_mean_exp(values[: len(usual)]), _log_mean_exp(values[len(usual) :])
+            everyday += usual_log - at
+            flips.append(other_log - usual_log + self.log_prior(frozenset((g,))))
+        return everyday + log_sum_exp([self.log_prior(none), *flips])
+
+    def mode(self, unlisted: frozenset[int]) -> FloatArray:
+        """The likeliest scales (G,) with these groups unlisted."""
+        if not unlisted:
+            return self.everyday_mode
+        tau = self._swept(self.everyday_mode, sorted(unlisted), unlisted)
+        others = [g for g in range(len(self.groups)) if g not in unlisted]
+        return self._swept(self._swept(tau, others, unlisted), sorted(unlisted), unlisted)
+
+    def flipped(self, unlisted: frozenset[int]) -> float:
+        """Log marginal likelihood with these groups unlisted, the scales of the others again at their mode."""
+        return self.integrated(self.mode(unlisted), unlisted)
+
+    def log_prior(self, unlisted: frozenset[int]) -> float:
+        """Log prior probability of exactly these groups being unlisted."""
+        everyday, other = self.prior_log
+        return (len(self.groups) - len(unlisted)) * everyday + len(unlisted) * other
+
+    def weights(self, least: float = 12.0) -> dict[frozenset[int], float]:
+        """Log of p(y | A, u) p(u) of no, single and pair flips; pairs of groups that are within `least` of the best by
+        themselves."""
+        none: frozenset[int] = frozenset()
+        found = {none: self.everyday + self.log_prior(none)}
+        for g in range(len(self.groups)):
+            one = frozenset((g,))
+            found[one] = self.flipped(one) + self.log_prior(one)
+        top = max(found.values())
+        near = sorted((s for s in found if len(s) == 1 and found[s] > top - least), key=lambda s: -found[s])[:PAIRED]
+        for i, a in enumerate(near):
+            for b in near[:i]:
+                pair = a | b
+                found[pair] = self.flipped(pair) + self.log_prior(pair)
+        return found
+
+
+#: Groups of which all pairs are tried.
+PAIRED = 4
+
+
+def _log_mean_exp(values: FloatArray) -> float:
+    top = float(values.max())
+    return top + float(np.log(np.mean(np.exp(values - top))))
+
+
+def log_sum_exp(values: Sequence[float]) -> float:
+    """log sum exp of some numbers; -inf of none."""
+    if not len(values):
+        return -np.inf
+    top = max(values)
+    return float(top) if not np.isfinite(top) else top + float(np.log(np.sum(np.exp(np.asarray(values) - top))))

@@ -1,0 +1,156 @@
+"""What is said: read off the table of sets.
+
+Effect, family, metadata error, unlisted physics: inclusion probabilities, sums over the sets that hold them. Sizes:
+mixtures over the sets of the conditional posteriors. The verdict: by these probabilities and the held-out check."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lab.inference.hypotheses import Hypothesis
+from lab.inference.search import Search, Table
+from sim.spectrum import FloatArray
+
+#: Threshold of a name, and of more likely than not.
+NAMED, LIKELIER = 0.95, 0.5
+#: Draws of the mixtures behind sizes.
+_DRAWS = 4000
+
+Verdict = Literal["no_mismatch", "explained", "partly_explained", "unexplained"]
+Kind = Literal["effect", "family", "unlisted"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A statement with its probability: that an effect acts, that any of a family does, that something unlisted acts on
+    a group's state."""
+
+    kind: Kind
+    name: str
+    probability: float
+
+
+@dataclass(frozen=True)
+class Size:
+    """A parameter of an effect, given that it acts: a mixture over the sets. `interval` holds 95 %. `is_determined`:
+    the interval doesn't hold absence."""
+
+    parameter: str
+    mean: float
+    std: float
+    interval: tuple[float, float]
+    is_determined: bool
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What the table says. `named`: effects, and families where no member is. `nothing`: p(no effect, nothing
+    unlisted)."""
+
+    findings: tuple[Finding, ...]
+    named: tuple[Finding, ...]
+    nothing: float
+    sizes: Mapping[str, tuple[Size, ...]]
+    left: float
+    is_undecided: bool
+
+    def probability(self, kind: Kind, name: str) -> float:
+        """Return the probability of a statement; 0 where the table doesn't hold it."""
+        return next((f.probability for f in self.findings if f.kind == kind and f.name == name), 0.0)
+
+
+def read_table(table: Table, hypotheses: Mapping[str, Hypothesis]) -> Posterior:
+    """Return what a table says."""
+    effects: dict[str, float] = {}
+    families: dict[str, float] = {}
+    unlisted: dict[str, float] = {}
+    nothing = 0.0
+    for row in table.rows:
+        for name in row.members:
+            effects[name] = effects.get(name, 0.0) + row.probability
+        for family in {hypotheses[name].family for name in row.members}:
+            families[family] = families.get(family, 0.0) + row.probability
+        for g in row.unlisted:
+            unlisted[table.groups[g]] = unlisted.get(table.groups[g], 0.0) + row.probability
+        if not row.members and not row.unlisted:
+            nothing += row.probability
+    for tail in table.tails:
+        for name in tail.members:
+            effects[name] = effects.get(name, 0.0) + tail.probability
+        for name, share in tail.effects.items():
+            effects[name] = effects.get(name, 0.0) + tail.probability * share
+        held_families = {hypotheses[name].family for name in tail.members}
+        for family in held_families | set(tail.families):
+            share = 1.0 if family in held_families else tail.families[family]
+            families[family] = families.get(family, 0.0) + tail.probability * share
+    kinds: tuple[tuple[Kind, dict[str, float]], ...] = (
+        ("effect", effects), ("family", families), ("unlisted", unlisted),
+    )  # fmt: skip
+    findings = [Finding(kind, name, min(p, 1.0)) for kind, found in kinds for name, p in found.items()]
+    findings.sort(key=lambda f: (-f.probability, f.kind, f.name))
+    named = [f for f in findings if f.kind == "effect" and f.probability >= NAMED]
+    held = {hypotheses[f.name].family for f in named}
+    named += [f for f in findings if f.kind == "family" and f.probability >= NAMED and f.name not in held]
+    sizes = {f.name: sizes_of(table, hypotheses, f.name) for f in named if f.kind == "effect"}
+    return Posterior(tuple(findings), tuple(named), nothing, sizes, table.left, table.is_undecided)
+
+
+def sizes_of(table: Table, hypotheses: Mapping[str, Hypothesis], name: str) -> tuple[Size, ...]:
+    """Return an effect's parameters in their own units, as mixtures over the refitted sets that hold it."""
+    rng = np.random.default_rng(0)
+    weights: dict[frozenset[str], float] = {}
+    for row in table.rows:
+        if row.refitted and name in row.members:
+            weights[row.members] = weights.get(row.members, 0.0) + row.probability
+    total = sum(weights.values())
+    if total <= 0.0:
+        return ()
+    draws: list[FloatArray] = []
+    for members, weight in weights.items():
+        fit = table.fits[members]
+        first = 0
+        for other in fit.state:
+            if other == name:
+                break
+            first += len(fit.state[other].u)
+        own = slice(first, first + len(fit.state[name].u))
+        count = round(_DRAWS * weight / total)
+        if count:
+            u = fit.state[name].u + fit.laplace.mean[own]
+            draws.append(rng.multivariate_normal(u, fit.laplace.covariance[own, own], count, check_valid="ignore"))
+    if not draws:
+        return ()
+    every = np.concatenate(draws)
+    found = []
+    for k, c in enumerate(hypotheses[name].coordinates):
+        u = np.clip(every[:, k], c.lower, c.upper)
+        low, high = np.quantile(u, [0.025, 0.975])
+        determined = c.is_shape or not low <= 0.0 <= high
+        value = u if c.to_value is None else np.array([c.to_value(float(x)) for x in u])
+        interval = np.quantile(value, [0.025, 0.975])
+        found.append(
+            Size(c.name, float(value.mean()), float(value.std()), (float(interval[0]), float(interval[1])), determined)
+        )
+    return tuple(found)
+
+
+def verdict(posterior: Posterior, least_nothing: float, check_passed: bool) -> Verdict:
+    """Return the verdict. `least_nothing`: p(nothing) that 1 % of healthy draws fall short of."""
+    calm = all(f.probability < LIKELIER for f in posterior.findings if f.kind == "unlisted")
+    if posterior.nothing > least_nothing and check_passed:
+        return "no_mismatch"
+    if not posterior.named:
+        return "unexplained"
+    return "explained" if calm and check_passed else "partly_explained"
+
+
+def healthy_nothing(search: Search, draws: int, rate: float, rng: np.random.Generator) -> float:
+    """Return the p(no effect, nothing unlisted) of which a share `rate` of healthy draws falls short.
+
+    Each draw has noise, theta and everyday delta of their priors; its table holds the empty set, all single effects in
+    closed form and all single flips."""
+    return float(np.quantile(search.healthy_draws(draws, rng), rate))

@@ -1,0 +1,888 @@
+"""The search: closed form about fitted sets, refits of the likeliest, and the table of sets with their probabilities.
+
+About a fitted set, with the whitened residual r and the whitened signatures G of all hypotheses, z = G'r and R = G'G
+give the evidence of every further set in closed form: all single hypotheses, all pairs, the best triples. The likeliest
+set that was never refitted is refitted next, until those that are left hold less than `LEFT` of the probability, or the
+budget is spent. Sets without one member of the likeliest are refitted, too; what promises most beside these is an
+exchange."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from lab.inference.hypotheses import (
+    DEGREES,
+    Coordinate,
+    Hypothesis,
+    SetPrior,
+    coordinates_of,
+    moved,
+    stacked,
+    symmetric,
+)
+from lab.inference.laplace import Laplace, bounds, correct_along, integrate, near_bound
+from lab.inference.model import (
+    Model,
+    Point,
+    ScaleIntegral,
+    State,
+    everyday_scales,
+    form_scales,
+    log_sum_exp,
+    scaled_columns,
+    with_columns,
+)
+from lab.observables.gaussian import Gaussian
+from sim.spectrum import FloatArray
+
+#: The budget: refits a side.
+REFITS = 60
+#: Mass of sets that were never refitted, above which a result is undecided.
+LEFT = 0.01
+#: Log odds below the likeliest set at which the closed form is trusted to rule a set out, however large its error.
+HOPELESS = 50.0
+#: The most hypotheses that are tried beside the likeliest set where the best gains more than `HOPELESS`.
+SINGLES = 8
+#: Refits of sets that the closed form about a set far below the likeliest promises: about such a set it isn't linear.
+DOUBTFUL = 3
+#: Gain of log evidence up to which the recordings say little of a set beyond its nearest refitted subset: the closed
+#: form is as good as a refit there.
+SILENT = 1.0
+#: P(any group is unlisted) of a camera.
+ANY_UNLISTED = 0.05
+#: Log odds below the likeliest set beyond which a set isn't made an origin of closed forms, and its scales aren't
+#: integrated in full.
+FAR_BELOW = 7.0
+#: Evaluations of the prediction in each of the two passes of a refit.
+EVALUATIONS = (8, 4)
+#: Pairs and triples that are integrated one by one about each origin; the others by an estimate.
+PAIRS, TRIPLES, EXTENSIONS = 120, 12, 10
+#: Standard deviations from its bound below which an amplitude's evidence is taken by quadrature.
+NEAR = 3.0
+#: Gain of log evidence up to which a size may be near 0, where shapes vanish.
+WEAK = 6.0
+#: Log evidence within which two alternatives of one hypothesis are both refitted, and the most that are.
+ALTERNATIVES_NEAR, MOST_ALTERNATIVES = 4.0, 2
+
+
+@dataclass(frozen=True)
+class FormFit:
+    """A fitted set with the form errors of its laws at one scale: log p(y | A) with the groups at their median everyday
+    scales (`base`), and the marginal likelihood of these scales, `start_log` there."""
+
+    form: float
+    base: float
+    scales: ScaleIntegral
+    start_log: float
+
+    @cached_property
+    def quick(self) -> float:
+        """Log p(y | A), flips with the scales of the others as without: a lower bound, near enough to rank sets."""
+        return self.base - self.start_log + self.scales.quick
+
+    @cached_property
+    def by_groups(self) -> Mapping[frozenset[int], float]:
+        """Log p(y | A, u) p(u), by which groups are unlisted: all single flips and the best pairs."""
+        return {u: self.base + w - self.start_log for u, w in self.scales.weights().items()}
+
+
+@dataclass(frozen=True)
+class FittedSet:
+    """A refitted set at its mode, for each scale of form errors (equally probable). `jacobian` (n, p) of m by u at the
+    mode; `others`: further modes of the posterior, which `shift` adds to the evidence of this one."""
+
+    state: State
+    coordinates: tuple[Coordinate, ...]
+    forms: tuple[FormFit, ...]
+    laplace: Laplace
+    jacobian: FloatArray
+    precision: FloatArray
+    pull: FloatArray
+    others: tuple[FittedSet, ...] = ()
+    shift: float = 0.0
+
+    @property
+    def members(self) -> frozenset[str]:
+        """Names of the active hypotheses."""
+        return frozenset(self.state)
+
+    @property
+    def base(self) -> float:
+        """Log p(y | A) with the groups at their median everyday scales."""
+        return self.shift + log_sum_exp([f.base for f in self.forms]) - float(np.log(len(self.forms)))
+
+    @cached_property
+    def quick(self) -> float:
+        """Log p(y | A), near enough to rank sets (`FormFit.quick`)."""
+        return self.shift + log_sum_exp([f.quick for f in self.forms]) - float(np.log(len(self.forms)))
+
+    @cached_property
+    def likeliest(self) -> FormFit:
+        """The likeliest scale of form errors."""
+        return max(self.forms, key=lambda f: f.quick)
+
+    @cached_property
+    def by_groups(self) -> Mapping[frozenset[int], float]:
+        """Log p(y | A, u) p(u), by which groups are unlisted, summed over the scales of form errors; those far below
+        the likeliest count for nothing."""
+        near = [f for f in self.forms if f.quick > self.likeliest.quick - FAR_BELOW]
+        sums: dict[frozenset[int], list[float]] = {}
+        for form in near:
+            for u, value in form.by_groups.items():
+                sums.setdefault(u, []).append(value)
+        return {u: self.shift + log_sum_exp(v) - float(np.log(len(self.forms))) for u, v in sums.items()}
+
+    @property
+    def total(self) -> float:
+        """Log p(y | A), summed over the groups that were tried."""
+        return log_sum_exp(list(self.by_groups.values()))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One set of the table: its members, the groups that are unlisted, its probability, whether it was refitted, and
+    whether it had to be: the recordings change its probability (`SILENT`)."""
+
+    members: frozenset[str]
+    unlisted: frozenset[int]
+    probability: float
+    refitted: bool
+    is_closed_form_enough: bool = False
+
+
+@dataclass(frozen=True)
+class Tail:
+    """All sets of three or more members more than `members` of which the recordings say little, together: their
+    probability, and by hypothesis the share that holds it, by family the share that holds any of it."""
+
+    members: frozenset[str]
+    probability: float
+    effects: Mapping[str, float]
+    families: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Table:
+    """All sets with their probabilities, likeliest first, and the fits of those that were refitted. `tails`: larger
+    sets, which aren't listed one by one."""
+
+    rows: tuple[Row, ...]
+    tails: tuple[Tail, ...]
+    fits: Mapping[frozenset[str], FittedSet]
+    groups: tuple[str, ...]
+    log_evidence: float
+    refits: int
+
+    @property
+    def left(self) -> float:
+        """Probability of the sets that had to be refitted and never were."""
+        return sum(r.probability for r in self.rows if not r.refitted and not r.is_closed_form_enough)
+
+    @property
+    def closed_form(self) -> float:
+        """Probability of the sets of which the recordings say so little that the closed form is enough."""
+        listed = sum(r.probability for r in self.rows if not r.refitted and r.is_closed_form_enough)
+        return listed + sum(t.probability for t in self.tails)
+
+    @property
+    def is_undecided(self) -> bool:
+        """Whether too much of the probability was never refitted."""
+        return self.left > LEFT
+
+
+@dataclass(frozen=True)
+class _Signature:
+    """An alternative's changes of the prediction (n, k), beside no other hypothesis."""
+
+    owner: str
+    index: int  # of the alternative
+    raw: FloatArray
+    coordinates: tuple[Coordinate, ...]  # of the coefficients
+    columns: tuple[int, ...]  # in the stacked table
+    points: tuple[tuple[int, int | None], ...]  # of each column, the alternative's points of positive and negative sign
+
+    def of_points(self, c: FloatArray, count: int) -> FloatArray:
+        """Return the coefficients (>= 0) of all points of the alternative, given those of the columns."""
+        found = np.zeros(count)
+        for (plus, minus), one in zip(self.points, c, strict=True):
+            if one >= 0.0 or minus is None:
+                found[plus] = max(one, 0.0)
+            else:
+                found[minus] = -one
+        return found
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    log_posterior: float
+    gain: float  # of log evidence over the origin
+    origin: frozenset[str]
+    alternatives: tuple[int, ...]  # signatures, by index
+    coefficients: tuple[FloatArray, ...]
+
+
+@dataclass
+class Search:
+    """The search for one side. `report` is called with each set that is refitted."""
+
+    model: Model
+    hypotheses: Mapping[str, Hypothesis]
+    prior: SetPrior
+    refits: int = REFITS
+    any_unlisted: float = ANY_UNLISTED
+    report: Callable[[str], None] = lambda text: None
+    fits: dict[frozenset[str], FittedSet] = field(default_factory=dict)
+    estimates: dict[frozenset[str], _Estimate] = field(default_factory=dict)
+    singles: dict[frozenset[str], dict[str, float]] = field(default_factory=dict)
+    _doubtful: int = 0  # refits of sets whose closed form is about a set that fits far worse
+
+    @cached_property
+    def _everyday(self) -> FloatArray:
+        """Columns of the groups at their median everyday scales."""
+        groups = self.model.groups
+        return scaled_columns(groups, everyday_scales(groups), len(self.model.value))
+
+    def run(self) -> Table:
+        """Fill the table."""
+        self._linearise(self.fit({}))
+        self._add_strong()
+        while len(self.fits) < self.refits:
+            less = self._without_one()
+            key = self._next() if less is None else None
+            if less is None and key is None:
+                break
+            fit = self.fit(less) if less is not None else self._refit_from(self.estimates[key or frozenset()])
+            self.report(", ".join(sorted(fit.members)) or "none")
+            if self._log_posterior(fit) > self._top() - FAR_BELOW:
+                self._linearise(fit)
+        return self.table()
+
+    def refit(self, members: frozenset[str]) -> FittedSet:
+        """Return the fit of a set, made if it wasn't: after those of its members by themselves, about the empty set.
+
+        Raises KeyError for a set that the closed form about the empty one has no estimate of."""
+        if frozenset[str]() not in self.fits:
+            self._linearise(self.fit({}))
+        for key in (*(frozenset((name,)) for name in members), members):
+            if key not in self.fits:
+                self._refit_from(self.estimates[key])
+        return self.fits[members]
+
+    # --- what is refitted next ---------------------------------------------------------------------------------------
+
+    def _log_posterior(self, fit: FittedSet) -> float:
+        return fit.quick + self.prior.log(fit.members)
+
+    def _top(self) -> float:
+        return max(self._log_posterior(f) for f in self.fits.values())
+
+    def _add_strong(self) -> None:
+        """While one more hypothesis promises so much that the closed form isn't linear, refit the likeliest set with
+        each of those that promise half of what the best does."""
+        while True:
+            origin = max(self.fits.values(), key=self._log_posterior)
+            if origin.members not in self.singles:
+                self._linearise(origin)
+            gains = self.singles[origin.members]
+            top = max(gains.values(), default=0.0)
+            if top < HOPELESS:
+                return
+            strong = sorted((n for n, gain in gains.items() if gain > 0.5 * top), key=lambda n: -gains[n])[:SINGLES]
+            keys = [origin.members | {name} for name in strong]
+            for key in keys:
+                estimate = self.estimates.get(key)
+                if key not in self.fits and estimate is not None and len(self.fits) < self.refits:
+                    self._refit_from(estimate)
+                    self.report(", ".join(sorted(key)))
+            if max(self.fits.values(), key=self._log_posterior) is origin:
+                return
+
+    def _without_one(self) -> State | None:
+        """Return the likeliest set without one of its members, from where it stands, if that was never refitted: of all
+        members the one nearest to 0, unless even that is excluded."""
+        best = max(self.fits.values(), key=self._log_posterior)
+        places = coordinates_of(self.hypotheses, best.state)
+        losses: list[tuple[float, str]] = []
+        for name in best.state:
+            own = [k for k, (owner, _, c) in enumerate(places) if owner == name and not c.is_shape]
+            if not own or best.members - {name} in self.fits:
+                continue
+            away = stacked(best.state)[own]
+            covariance = best.laplace.covariance[np.ix_(own, own)] + 1e-12 * np.diag(np.square(away) + 1e-300)
+            losses.append((0.5 * float(away @ np.linalg.pinv(covariance) @ away), name))
+        if not losses or min(losses)[0] > HOPELESS:
+            return None
+        return {name: point for name, point in best.state.items() if name != min(losses)[1]}
+
+    def _next(self) -> frozenset[str] | None:
+        """Return the likeliest set that was never refitted; None where these hold less than `LEFT` together."""
+        top = self._top()
+        speaking = {k: e for k, e in self.estimates.items() if k not in self.fits and e.gain > SILENT}
+        near = {k: e.log_posterior for k, e in speaking.items() if self._is_near(e)}
+        everything = [*near.values(), *(self._log_posterior(f) for f in self.fits.values())]
+        if near and log_sum_exp(list(near.values())) > log_sum_exp(everything) + np.log(0.5 * LEFT):
+            return self._first_part(max(near, key=lambda key: near[key]))
+        far = {k: e.log_posterior for k, e in speaking.items() if k not in near and e.log_posterior > top - HOPELESS}
+        if far and self._doubtful < DOUBTFUL:
+            self._doubtful += 1
+            return self._first_part(max(far, key=lambda key: far[key]))
+        return None
+
+    def _is_near(self, estimate: _Estimate) -> bool:
+        """Whether an estimate's origin is near enough the likeliest set for its closed form to be believed."""
+        return self._log_posterior(self.fits[estimate.origin]) > self._top() - HOPELESS
+
+    def _first_part(self, key: frozenset[str]) -> frozenset[str]:
+        """Return the part of a set that is refitted before it: one whose gain over the same origin is at least half of
+        its own. About a strong effect everything is linear again, about none it isn't."""
+        whole = self.estimates[key]
+        parts = [
+            part for name in key - whole.origin
+            if (part := key - {name}) not in self.fits and part in self.estimates
+            and self.estimates[part].origin == whole.origin and self.estimates[part].gain > 0.5 * whole.gain
+        ]  # fmt: skip
+        if not parts or whole.gain < HOPELESS:
+            return key
+        return self._first_part(max(parts, key=lambda part: self.estimates[part].log_posterior))
+
+    def _refit_from(self, estimate: _Estimate) -> FittedSet:
+        origin = self.fits[estimate.origin]
+        starts = [self._start(origin, estimate.alternatives, estimate.coefficients)]
+        signatures = self._signatures
+        alone = {name: self.fits.get(frozenset((name,))) for name in starts[0]}
+        if len(starts[0]) > 1 and all(alone.values()):
+            other: State = {name: f.state[name] for name, f in alone.items() if f is not None}
+            starts = [max((starts[0], other), key=self._log_density)]
+        for index in estimate.alternatives:
+            owner = signatures[index].owner
+            stands = self._as_it_stands.get((origin.members, owner))
+            if stands is not None:
+                starts = [max((starts[0], {**starts[0], owner: stands}), key=self._log_density)]
+        if len(estimate.alternatives) == 1:
+            owner = signatures[estimate.alternatives[0]].owner
+            for index, c in self._near_alternatives(origin, owner, estimate.alternatives[0]):
+                starts.append(self._start(origin, (index,), (c,)))
+        found = [self._fit_at(state) for state in starts]
+        best = max(found, key=lambda f: f.base)
+        modes: list[FittedSet] = []
+        for one in sorted(found, key=lambda f: -f.base):
+            if all(_differ(one, m) for m in modes):
+                modes.append(one)
+        total = log_sum_exp([m.base for m in modes])
+        merged = replace(best, shift=total - best.base, others=tuple(modes[1:]))
+        merged = self._by_grid_where_weak(merged, estimate)
+        self.fits[merged.members] = merged
+        return merged
+
+    def _by_grid_where_weak(self, fit: FittedSet, estimate: _Estimate) -> FittedSet:
+        """Return the fit with the closed form's evidence in place of Laplace's where the one hypothesis that joined its
+        origin has shapes and a size compatible with 0: its shapes vanish there, and are summed over the grid of
+        their prior, the alternatives."""
+        joined = fit.members - estimate.origin
+        if len(joined) != 1:
+            return fit
+        (name,) = joined
+        if not any(c.is_shape for c in self.hypotheses[name].coordinates):
+            return fit
+        if all(c.is_shape for c in self.hypotheses[name].coordinates):
+            return fit
+        origin = self.fits[estimate.origin]
+        gain = self.singles.get(estimate.origin, {}).get(name)
+        if gain is None or max(gain, fit.base - origin.base) > WEAK:
+            return fit
+        return replace(fit, shift=fit.shift + origin.base + gain - fit.base)
+
+    def _log_density(self, state: State) -> float:
+        """Log of p(y | u) p(u), everyday scales and form errors at their medians."""
+        forms = form_scales(self.model.has_form_error(state))
+        value = self._gaussian(state, forms[len(forms) // 2]).log_likelihood(self.model.value)
+        places = coordinates_of(self.hypotheses, state)
+        return value + sum(float(c.log_prior(float(u))) for (_, _, c), u in zip(places, stacked(state), strict=True))
+
+    def _start(self, origin: FittedSet, which: Sequence[int], coefficients: Sequence[FloatArray]) -> State:
+        state = dict(origin.state)
+        for index, c in zip(which, coefficients, strict=True):
+            signature = self._signatures[index]
+            hypothesis = self.hypotheses[signature.owner]
+            alternative = hypothesis.alternatives[signature.index]
+            state[signature.owner] = hypothesis.start(alternative, signature.of_points(c, len(alternative.points)))
+        return state
+
+    # --- a refit -----------------------------------------------------------------------------------------------------
+
+    def fit(self, state: State) -> FittedSet:
+        """Return the fit of a set from these parameters, and keep it."""
+        fit = self._fit_at(state)
+        self.fits[fit.members] = fit
+        return fit
+
+    def _gaussian(self, state: State, form: float) -> Gaussian:
+        return with_columns(self.model.gaussian(state, form), self._everyday)
+
+    def _fit_at(self, state: State) -> FittedSet:
+        y = self.model.value
+        places = coordinates_of(self.hypotheses, state)
+        coords = [c for _, _, c in places]
+        forms = form_scales(self.model.has_form_error(state))
+        middle = forms[len(forms) // 2]
+        u = stacked(state)
+        if len(u):
+            for most in EVALUATIONS:
+                before, u = u, self._mode(moved(state, u), coords, u, self._gaussian(moved(state, u), middle), most)
+                if np.all(np.abs(u - before) < 1e-3 * np.array([c.unit for c in coords])):
+                    break
+        state = moved(state, u)
+        mean = self.model.mean(state)
+        jacobian = self._jacobian(state, coords, u, mean)
+        own = sum(self.hypotheses[name].log_prior(point) for name, point in state.items())
+        precision, pull = _normal_prior(coords, u)
+        fits, found = [], None
+        for form in forms:
+            bare = self.model.gaussian(state, form)
+            gaussian = with_columns(bare, self._everyday)
+            white = gaussian.whiten(np.column_stack([jacobian, y - mean]))
+            table, r = white[:, :-1], white[:, -1]
+            laplace = self._integral(state, coords, u, gaussian, table, r)
+            if form == middle:
+                found = laplace
+            scales = ScaleIntegral.of(bare, y - mean, self.model.groups, jacobian, precision, pull, self.any_unlisted)
+            start_log = scales.log_likelihood(everyday_scales(self.model.groups))
+            base = own + gaussian.log_likelihood(y) + laplace.log_integral
+            fits.append(FormFit(form, base, scales, start_log))
+        assert found is not None
+        return FittedSet(state, tuple(coords), tuple(fits), found, jacobian, precision, pull)
+
+    def _mode(
+        self, state: State, coords: Sequence[Coordinate], u: FloatArray, gaussian: Gaussian, most: int
+    ) -> FloatArray:
+        y = self.model.value
+        low, high = bounds(coords)
+        unit = np.array([c.unit for c in coords])
+
+        def residual(at: FloatArray) -> FloatArray:
+            white = gaussian.whiten(y - self.model.mean(moved(state, at)))
+            return np.concatenate([white, [c.residual(float(x))[0] for c, x in zip(coords, at, strict=True)]])
+
+        def slope(at: FloatArray) -> FloatArray:
+            mean = self.model.mean(moved(state, at))
+            white = gaussian.whiten(self._jacobian(moved(state, at), coords, at, mean))
+            return np.vstack([-white, np.diag([c.residual(float(x))[1] for c, x in zip(coords, at, strict=True)])])
+
+        inside = np.clip(u, low + 1e-9 * unit, high - 1e-9 * unit)
+        found = least_squares(
+            residual, inside, jac=slope, bounds=(low, high), x_scale=unit, max_nfev=most, xtol=1e-5, ftol=1e-5
+        )
+        return np.asarray(found.x)
+
+    def _jacobian(self, state: State, coords: Sequence[Coordinate], u: FloatArray, mean: FloatArray) -> FloatArray:
+        columns = []
+        for k, c in enumerate(coords):
+            step = c.step or 0.02 * c.unit
+            shifted = u.copy()
+            shifted[k] += -step if u[k] + step > c.upper else step
+            columns.append((self.model.mean(moved(state, shifted)) - mean) / (shifted[k] - u[k]))
+        return np.array(columns).T if columns else np.zeros((len(mean), 0))
+
+    def _integral(
+        self, state: State, coords: Sequence[Coordinate], u: FloatArray, gaussian: Gaussian, table: FloatArray,
+        r: FloatArray,
+    ) -> Laplace:  # fmt: skip
+        a, b = table.T @ table, table.T @ r
+        found = integrate(a, b, coords, u)
+        near = near_bound(found, coords, u, NEAR)
+        if len(near) != 1:
+            return found
+        (k,) = near
+        c = coords[k]
+        slope, precision = c.slope_and_precision(float(u[k]))
+        at = float(r @ r)
+
+        def exact(d: FloatArray) -> float:
+            white = gaussian.whiten(self.model.value - self.model.mean(moved(state, u + d)))
+            return -0.5 * (float(white @ white) - at) + float(c.log_prior(u[k] + d[k]) - c.log_prior(float(u[k])))
+
+        def approximate(d: FloatArray) -> float:
+            return float(b @ d - 0.5 * d @ a @ d + slope * d[k] - 0.5 * precision * d[k] ** 2)
+
+        plain = integrate(a, b, coords, u, skip=frozenset((k,)))
+        more = correct_along(plain, k, coords, u, approximate, exact)
+        return Laplace(plain.log_integral + more, plain.mean, plain.covariance)
+
+    # --- closed form about a fitted set ------------------------------------------------------------------------------
+
+    @cached_property
+    def _signatures(self) -> tuple[_Signature, ...]:
+        base = self.model.mean({})
+        found: list[_Signature] = []
+        at = 0
+        for name, hypothesis in self.hypotheses.items():
+            for index, alternative in enumerate(hypothesis.alternatives):
+                raw = np.column_stack([self.model.mean({name: p}) - base for p in alternative.points])
+                if not raw.any():
+                    continue
+                points = _merged(raw, alternative.scales)
+                raw = raw[:, [plus for plus, _ in points]]
+                coords = tuple(
+                    Coordinate("c", alternative.scales[plus], lower=0.0 if minus is None else -np.inf)
+                    for plus, minus in points
+                )
+                columns = tuple(range(at, at + raw.shape[1]))
+                found.append(_Signature(name, index, raw, coords, columns, points))
+                at += raw.shape[1]
+        return tuple(found)
+
+    @cached_property
+    def _stack(self) -> FloatArray:
+        if not self._signatures:
+            return np.zeros((len(self.model.value), 0))
+        return np.concatenate([s.raw for s in self._signatures], axis=1)
+
+    def _linear(self, origin: FittedSet, unlisted: frozenset[int]) -> tuple[FloatArray, FloatArray]:
+        """Return z and R about a fitted set, its own parameters marginalised, with these groups unlisted."""
+        groups = self.model.groups
+        tau = origin.likeliest.scales.mode(unlisted)
+        gaussian = with_columns(
+            self.model.gaussian(origin.state, origin.likeliest.form),
+            scaled_columns(groups, tau, len(self.model.value)),
+        )
+        residual = self.model.value - gaussian.mean
+        if len(origin.precision):
+            gaussian = with_columns(gaussian, origin.jacobian / np.sqrt(origin.precision))
+            residual = residual - origin.jacobian @ (origin.pull / origin.precision)
+        white = gaussian.whiten(np.column_stack([self._stack, residual]))
+        table, r = white[:, :-1], white[:, -1]
+        return table.T @ r, table.T @ table
+
+    def _near_alternatives(self, origin: FittedSet, owner: str, chosen: int) -> list[tuple[int, FloatArray]]:
+        """Return other alternatives of a hypothesis that are nearly as likely as the one chosen."""
+        known = self._by_alternative[origin.members]
+        own = {i: v for i, (v, _) in known.items() if self._signatures[i].owner == owner}
+        near = [i for i in own if i != chosen and own[i] > own[chosen] - ALTERNATIVES_NEAR]
+        near.sort(key=lambda i: -own[i])
+        return [(i, known[i][1]) for i in near[: MOST_ALTERNATIVES - 1]]
+
+    @cached_property
+    def _by_alternative(self) -> dict[frozenset[str], dict[int, tuple[float, FloatArray]]]:
+        return {}
+
+    @cached_property
+    def _as_it_stands(self) -> dict[tuple[frozenset[str], str], Point]:
+        """By origin and owner, the point of an alternative that is likeliest as it stands: of large changes, scaling by
+        the closed form's coefficient may be far off."""
+        return {}
+
+    def _linearise(self, origin: FittedSet) -> None:
+        """Estimate all sets with one, two or three members more than a fitted one: with all groups everyday, and with
+        the likeliest of them unlisted where that matters."""
+        weights = origin.by_groups
+        none: frozenset[int] = frozenset()
+        best = max(weights, key=lambda u: weights[u])
+        for unlisted in dict.fromkeys((none, best)):
+            if weights[unlisted] > weights[best] - FAR_BELOW or unlisted == none:
+                self._linearise_with(origin, unlisted)
+
+    def _linearise_with(self, origin: FittedSet, unlisted: frozenset[int]) -> None:
+        z, gram = self._linear(origin, unlisted)
+        weight = origin.by_groups[unlisted]
+        signatures = self._signatures
+        single: dict[int, tuple[float, FloatArray]] = {}
+        owners: dict[str, list[int]] = {}
+        for i, s in enumerate(signatures):
+            if s.owner not in origin.state:
+                single[i] = _set_integral(z, gram, [s])
+                owners.setdefault(s.owner, []).append(i)
+        gains = {o: log_sum_exp([single[i][0] for i in own]) - float(np.log(len(own))) for o, own in owners.items()}
+        if not unlisted:
+            for o, own in owners.items():
+                taken = {
+                    (i, point): z[k] - 0.5 * gram[k, k]
+                    for i in own
+                    for k, (point, _) in zip(signatures[i].columns, signatures[i].points, strict=True)
+                }
+                i, point = max(taken, key=lambda key: taken[key])
+                alternative = self.hypotheses[o].alternatives[signatures[i].index]
+                self._as_it_stands[origin.members, o] = alternative.points[point]
+            self._by_alternative[origin.members] = single
+            self.singles[origin.members] = gains
+        best = {o: max(own, key=lambda i: single[i][0]) for o, own in owners.items()}
+        shared = {o: gains[o] - single[best[o]][0] for o in owners}  # of all alternatives over the best
+        for o, gain in gains.items():
+            self._estimate(origin, weight, {o}, gain, (best[o],), (single[best[o]][1],))
+        pairs = self._pairs(origin, weight, z, gram, single, owners, shared)
+        self._triples(origin, weight, z, gram, pairs, best, gains, shared)
+
+    def _estimate(
+        self, origin: FittedSet, weight: float, more: set[str], gain: float, which: tuple[int, ...],
+        c: tuple[FloatArray, ...],
+    ) -> None:  # fmt: skip
+        """Note a set's log posterior with `weight` the log p(y | A, u) p(u) of its origin. The estimate about the
+        largest origin counts, of several the likeliest; those of one origin by other groups are summed."""
+        key = origin.members | more
+        value = weight + gain + self.prior.log(key)
+        known = self.estimates.get(key)
+        if not np.isfinite(value):
+            return
+        if known is not None and known.origin == origin.members:
+            total = float(np.logaddexp(value, known.log_posterior))
+            first = known if known.log_posterior > value else _Estimate(total, gain, origin.members, which, c)
+            self.estimates[key] = replace(first, log_posterior=total)
+        elif known is None or self._is_nearer(origin, known):
+            self.estimates[key] = _Estimate(value, gain, origin.members, which, c)
+
+    def _is_nearer(self, origin: FittedSet, known: _Estimate) -> bool:
+        other = self.fits[known.origin]
+        return (len(origin.members), self._log_posterior(origin)) > (len(other.members), self._log_posterior(other))
+
+    def _pairs(
+        self, origin: FittedSet, weight: float, z: FloatArray, gram: FloatArray,
+        single: Mapping[int, tuple[float, FloatArray]], owners: Mapping[str, list[int]], shared: Mapping[str, float],
+    ) -> list[tuple[float, str, str, int, int]]:  # fmt: skip
+        """Estimate all pairs, the best of them one by one; return these, likeliest first."""
+        signatures = self._signatures
+        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        unit_z, rho = z / size, gram / np.outer(size, size)
+        two = np.array([not np.isfinite(c.lower) for s in signatures for c in s.coordinates], bool)
+        angle = np.maximum(1.0 - rho**2, 1e-6)
+        first, second = (unit_z[:, None] - rho * unit_z) / angle, (unit_z - rho * unit_z[:, None]) / angle
+        inside = ((first > 0) | two[:, None]) & ((second > 0) | two)
+        alone = np.where(two, np.square(unit_z), np.square(np.maximum(unit_z, 0.0)))
+        bound = np.maximum(
+            np.where(inside, first * unit_z[:, None] + second * unit_z, 0.0), np.maximum(alone[:, None], alone)
+        )
+        occam = {}
+        for i in single:
+            own = list(signatures[i].columns)
+            occam[i] = single[i][0] - 0.5 * float(alone[own].max())
+        tried = []
+        names = list(owners)
+        columns = {o: np.concatenate([signatures[i].columns for i in owners[o]]).astype(int) for o in names}
+        of_column = np.array([i for i, s in enumerate(signatures) for _ in s.columns], int)
+        for a, name in enumerate(names):
+            for other in names[:a]:
+                part = bound[np.ix_(columns[name], columns[other])]
+                i, j = divmod(int(np.argmax(part)), part.shape[1])
+                one, two_ = int(of_column[columns[name][i]]), int(of_column[columns[other][j]])
+                gain = 0.5 * float(part[i, j]) + min(occam[one], 0.0) + min(occam[two_], 0.0)
+                gain += shared[name] + shared[other]
+                tried.append((gain, name, other, one, two_))
+        prior = {n: float(np.log(self.prior.weight[n])) for n in names}
+        tried.sort(key=lambda t: -(t[0] + prior[t[1]] + prior[t[2]]))
+        exact = []
+        for rank, (gain, name, other, one, two_) in enumerate(tried):
+            value, c = gain, (single[one][1], single[two_][1])
+            if rank < PAIRS:
+                integral, both = _set_integral(z, gram, [signatures[one], signatures[two_]])
+                value = integral + shared[name] + shared[other]
+                cut = len(signatures[one].coordinates)
+                c = (both[:cut], both[cut:])
+                exact.append((value, name, other, one, two_))
+            self._estimate(origin, weight, {name, other}, value, (one, two_), c)
+        return sorted(exact, key=lambda t: -(t[0] + prior[t[1]] + prior[t[2]]))
+
+    def _triples(
+        self, origin: FittedSet, weight: float, z: FloatArray, gram: FloatArray,
+        pairs: Sequence[tuple[float, str, str, int, int]], best: Mapping[str, int],
+        gains: Mapping[str, float], shared: Mapping[str, float],
+    ) -> None:  # fmt: skip
+        """Estimate the best pairs with the hypotheses that promise most beside them."""
+        signatures = self._signatures
+        for gain, name, other, one, two in pairs[:TRIPLES]:
+            if gain <= max(gains[name], gains[other]) + SILENT:
+                continue
+            left = self._left(z, gram, [signatures[one], signatures[two]])
+            promising = sorted((o for o in best if o not in (name, other)), key=lambda o: -left[best[o]])[:EXTENSIONS]
+            for third in promising:
+                three = [signatures[i] for i in (one, two, best[third])]
+                value, c = _set_integral(z, gram, three)
+                cuts = np.cumsum([len(s.coordinates) for s in three])[:-1]
+                value += sum(shared[o] for o in (name, other, third))
+                self._estimate(
+                    origin, weight, {name, other, third}, value, (one, two, best[third]), tuple(np.split(c, cuts))
+                )  # fmt: skip
+
+    def _left(self, z: FloatArray, gram: FloatArray, members: Sequence[_Signature]) -> FloatArray:
+        """Return what one column of each signature by itself takes of the residual that `members` leave."""
+        own = [k for s in members for k in s.columns]
+        inner = gram[np.ix_(own, own)] + 1e-8 * np.diag(np.diag(gram)[own] + 1e-300)
+        weight = np.linalg.solve(inner, np.column_stack([z[own], gram[own]]))
+        rest = z - gram[:, own] @ weight[:, 0]
+        square = np.maximum(np.diag(gram) - np.einsum("ij,ji->i", gram[:, own], weight[:, 1:]), 1e-6 * np.diag(gram))
+        two = np.array([not np.isfinite(c.lower) for s in self._signatures for c in s.coordinates], bool)
+        taken = np.square(np.where(two, rest, np.maximum(rest, 0.0))) / np.maximum(square, 1e-300)
+        return np.array([taken[list(s.columns)].max() for s in self._signatures])
+
+    def healthy_draws(self, draws: int, rng: np.random.Generator) -> FloatArray:
+        """Return p(no effect, nothing unlisted) of draws without either, (draws,), by single effects and flips."""
+        groups = self.model.groups
+        gaussian = self.model.gaussian({}, 0.0)
+        sizes = [g.columns.shape[1] for g in groups]
+        white = gaussian.whiten(np.concatenate([*(g.columns for g in groups), self._stack], axis=1))
+        gram, at, none = white.T @ white, sum(sizes), np.zeros(0)
+        empty = np.zeros((len(white), 0))
+        scales = ScaleIntegral.of(gaussian, np.zeros(len(white)), groups, empty, none, none, self.any_unlisted)
+        found = []
+        for _ in range(draws):
+            tau = np.array([g.everyday * abs(rng.standard_normal()) for g in groups])
+            r = rng.standard_normal(len(white)) + white[:, :at] @ (np.repeat(tau, sizes) * rng.standard_normal(at))
+            projected = white.T @ r
+            one = replace(scales, projected=projected[:at], _known={})
+            found.append(self._nothing(one, gram, projected, at))
+        return np.array(found)
+
+    def _nothing(self, scales: ScaleIntegral, gram: FloatArray, projected: FloatArray, at: int) -> float:
+        """Return p(nothing) of one draw, of which `gram` and `projected` are M and W'r, groups first."""
+        none: frozenset[int] = frozenset()
+        amplitude = np.repeat(scales.everyday_mode, scales.group_sizes)
+        inner = np.eye(at) + amplitude[:, None] * gram[:at, :at] * amplitude
+        across = amplitude[:, None] * gram[:at, at:]
+        solved = np.linalg.solve(inner, np.column_stack([across, amplitude * projected[:at]]))
+        square = np.diag(gram)[at:] - np.einsum("ij,ij->j", across, solved[:, :-1])
+        z = projected[at:] - across.T @ solved[:, -1]
+        log = [scales.quick]  # of the empty set, with and without flips
+        empty = self.prior.log(frozenset())
+        alternatives = {name: sum(s.owner == name for s in self._signatures) for name in self.hypotheses}
+        for s in self._signatures:
+            share = self.prior.log(frozenset((s.owner,))) - empty - np.log(alternatives[s.owner])
+            each = zip(s.columns, s.coordinates, strict=True)
+            log.append(scales.quick + share + max(_amplitude_log_odds(z[k], square[k], c) for k, c in each))
+        return float(np.exp(scales.everyday + scales.log_prior(none) - log_sum_exp(log)))
+
+    # --- the table ---------------------------------------------------------------------------------------------------
+
+    def table(self) -> Table:
+        """Return all sets with their probabilities: of refitted ones by the groups that are unlisted."""
+        top = self._top()
+        log: dict[tuple[frozenset[str], frozenset[int]], float] = {}
+        for key, fit in self.fits.items():
+            prior = self.prior.log(key)
+            if self._log_posterior(fit) > top - 2.0 * FAR_BELOW:
+                log |= {(key, u): w + prior for u, w in fit.by_groups.items()}
+            else:
+                log[key, frozenset()] = self._log_posterior(fit)
+        open_ = {k: e for k, e in self.estimates.items() if k not in self.fits and self._is_near(e)}
+        log |= {(k, frozenset()): e.log_posterior for k, e in open_.items()}
+        tails = {
+            k: self._tail(self.fits[k]) for k in self.singles if self._log_posterior(self.fits[k]) > top - FAR_BELOW
+        }
+        total = log_sum_exp([*log.values(), *(t.probability for t in tails.values())])
+        enough = {k for k, e in self.estimates.items() if e.gain <= SILENT}
+        rows = [Row(k, u, float(np.exp(v - total)), k in self.fits, k in enough) for (k, u), v in log.items()]
+        rows.sort(key=lambda r: -r.probability)
+        shares = tuple(replace(t, probability=float(np.exp(t.probability - total))) for t in tails.values())
+        return Table(
+            tuple(rows), shares, dict(self.fits), tuple(g.name for g in self.model.groups), total, len(self.fits)
+        )
+
+    def _tail(self, origin: FittedSet) -> Tail:
+        """Return the tail of a linearised set, with the log of its evidence times prior as `probability`. The evidence
+        of silent hypotheses is taken as the product of those of each alone."""
+        gains = {n: g for n, g in self.singles[origin.members].items() if g <= SILENT}
+        weight = {n: float(self.prior.weight[n] * np.exp(g)) for n, g in gains.items()}
+        most = len(self.prior.number) - 1 - len(origin.members)
+        sizes = range(3, most + 1)
+        inside = float(np.prod([self.prior.weight[n] for n in origin.members]))
+        factor = {k: self.prior.scale(len(origin.members) + k) * inside for k in sizes}
+
+        def mass(without: Sequence[str]) -> float:
+            sums = symmetric([w for n, w in weight.items() if n not in without], max(most, 0))
+            return float(sum(factor[k] * sums[k] for k in sizes if k < len(sums)))
+
+        whole = mass(())
+        if whole <= 0.0:
+            return Tail(origin.members, -np.inf, {}, {})
+        families: dict[str, list[str]] = {}
+        for name in gains:
+            families.setdefault(self.hypotheses[name].family, []).append(name)
+        effects = {n: 1.0 - mass((n,)) / whole for n in gains}
+        held = {f: 1.0 - mass(names) / whole for f, names in families.items()}
+        return Tail(origin.members, origin.quick + float(np.log(whole)), effects, held)
+
+
+def _differ(one: FittedSet, other: FittedSet) -> bool:
+    """Whether two fits of a set are at different modes."""
+    if any(
+        one.state[n].template is not other.state[n].template and _choices(one.state[n]) != _choices(other.state[n])
+        for n in one.state
+    ):
+        return True
+    std = np.sqrt(np.diag(one.laplace.covariance) + np.diag(other.laplace.covariance))
+    away = np.abs(stacked(one.state) - np.concatenate([other.state[n].u for n in one.state]))
+    return bool(np.any(away > 2.0 * std))
+
+
+def _choices(point: Point) -> object:
+    template = point.template
+    return None if template is None else tuple(getattr(template, n) for n in type(template).choices())
+
+
+def _normal_prior(coords: Sequence[Coordinate], u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return precision and pull = precision (centre - u) of the normal prior about each centre with the same slope at
+    u."""
+    precision = []
+    for c, x in zip(coords, u, strict=True):
+        if not np.isfinite(c.scale):
+            precision.append((c.upper - c.lower) ** -2.0)
+        elif c.is_shape:
+            precision.append(c.scale**-2.0)
+        else:
+            precision.append((DEGREES + 1.0) / (DEGREES + ((x - c.centre) / c.scale) ** 2) / c.scale**2)
+    found = np.array(precision)
+    centre = np.array([c.centre if np.isfinite(c.scale) else x for c, x in zip(coords, u, strict=True)])
+    return found, found * (centre - u)
+
+
+def _merged(raw: FloatArray, scales: Sequence[float]) -> tuple[tuple[int, int | None], ...]:
+    """Return which columns stand for which of the points: two of opposite sign are one column."""
+    found: dict[int, int | None] = {}
+    size = np.linalg.norm(raw, axis=0)
+    for k in range(raw.shape[1]):
+        opposite = [
+            j for j, other in found.items()
+            if other is None and raw[:, j] @ raw[:, k] < -0.98 * size[j] * size[k]
+            and abs(scales[j] - scales[k]) < 1e-9 * scales[k]
+        ]  # fmt: skip
+        if opposite:
+            found[opposite[0]] = k
+        else:
+            found[k] = None
+    return tuple(found.items())
+
+
+def _set_integral(z: FloatArray, gram: FloatArray, members: Sequence[_Signature]) -> tuple[float, FloatArray]:
+    """Log evidence ratio of some signatures together over none, and the coefficients at the mode."""
+    own = [k for s in members for k in s.columns]
+    coords = [c for s in members for c in s.coordinates]
+    a, b = gram[np.ix_(own, own)], z[own]
+    low = np.array([c.lower for c in coords])
+    scale = np.array([c.scale for c in coords])
+    c = np.zeros(len(own))
+    for _ in range(40):
+        before = c.copy()
+        for k in range(len(own)):
+            weight = (DEGREES + 1.0) / (DEGREES + (c[k] / scale[k]) ** 2) / scale[k] ** 2
+            c[k] = max((b[k] - a[k] @ c + a[k, k] * c[k]) / (a[k, k] + weight), low[k])
+        if np.all(np.abs(c - before) < 1e-4 * scale):
+            break
+    slope = b - a @ c
+    found = integrate(a, slope, coords, c)
+    return float(b @ c - 0.5 * c @ a @ c) + found.log_integral, c
+
+
+def _amplitude_log_odds(z: float, square: float, coordinate: Coordinate) -> float:
+    """Return the log evidence ratio of one amplitude: log integral of exp(z c - square c^2 / 2) p(c)."""
+    size = abs(z) / max(square, coordinate.scale**-2)
+    if size < 8.0 * coordinate.scale and z * size < 40.0:
+        width = min(coordinate.scale, 1.0 / np.sqrt(max(square, 1e-300)))
+        c = np.linspace(0.0 if coordinate.lower == 0.0 else -1.0, 1.0, 161) * (12.0 * width + size)
+        density = np.exp(coordinate.log_prior(c)) * (c[1] - c[0])
+        if coordinate.lower == 0.0:
+            density[0] *= 0.5
+        return float(np.log(np.exp(z * c - 0.5 * square * c**2) @ density))
+    u = np.array([max(z / max(square, 1e-300), coordinate.lower)])
+    found = integrate(np.array([[square]]), np.array([z - square * u[0]]), [coordinate], u)
+    return found.log_integral + float(z * u[0] - 0.5 * square * u[0] ** 2)

@@ -1,0 +1,322 @@
+"""Results in a notebook: a summary in words, a table of what matters, and the chart that tells most."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import singledispatch
+from html import escape
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+from lab.calibration.life import History
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, Skipped, ValidationResult
+from lab.formats.results.words import measured
+from lab.observables.observable import measurement_title
+from lab.pipeline import PipelineResult
+from lab.predict.simulate import Simulation, preview
+from lab.report import answers, dataframes, words
+from lab.report.figures import by_side, stereo_figures
+from lab.report.pictures import frame_picture, photograph_data_uri
+from lab.report.plots import charts_of, picture
+from lab.twin.score import TwinScore, conclusion, title
+from lab.twin.sealed import SealedPrediction
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: Charts of a summary, rows of its table, pictures of a recording set's captures, and lines of what isn't determined in
+#: a text.
+CHARTS, ROWS, FRAMES, SKIPPED = 2, 30, 6, 4
+FRAME_PX = 200
+
+
+@dataclass(frozen=True)
+class ShownSummary:
+    """What is shown of a result.
+
+    headline : in a sentence
+    headings, rows : its table
+    lines : sentences below the table
+    skipped : what the recordings don't determine
+    pictures : HTML of its pictures; called for HTML alone
+    """
+
+    headline: str
+    headings: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    lines: tuple[str, ...] = ()
+    skipped: tuple[str, ...] = ()
+    pictures: Callable[[], str] = str
+
+
+def html(result: Any) -> str:
+    """Return the summary of a result with its pictures, as HTML that needs nothing else."""
+    shown = summary(result)
+    parts = [f"<p><b>{escape(shown.headline)}</b></p>"]
+    if shown.rows:
+        body = "".join(_row("td", row) for row in shown.rows[:ROWS])
+        parts.append(f"<table><thead>{_row('th', shown.headings)}</thead><tbody>{body}</tbody></table>")
+        parts += [f"<p>{len(shown.rows) - ROWS} more rows: to_dataframe()</p>"] if len(shown.rows) > ROWS else []
+    parts += [f"<p>{escape(line)}</p>" for line in shown.lines]
+    parts.append(shown.pictures())
+    if shown.skipped:
+        items = "".join(f"<li>{escape(line)}</li>" for line in shown.skipped)
+        parts.append(f"<details><summary>{len(shown.skipped)} not determined</summary><ul>{items}</ul></details>")
+    return f'<div class="calibench">{"".join(parts)}</div>'
+
+
+def _row(kind: str, cells: Sequence[str]) -> str:
+    """Return a row of a table; `kind`: `th` or `td`."""
+    inside = "".join(f'<{kind} align="left">{escape(cell)}</{kind}>' for cell in cells)
+    return f"<tr>{inside}</tr>"
+
+
+def text(result: Any) -> str:
+    """Return the summary of a result as lines of text."""
+    shown = summary(result)
+    rows = [shown.headings, *shown.rows[:ROWS]] if shown.rows else []
+    widths = [max(len(row[k]) for row in rows) for k in range(len(shown.headings))] if rows else []
+    lines = [" ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    skipped = [f"not determined: {line}" for line in shown.skipped[:SKIPPED]]
+    more = [f"and {len(shown.skipped) - SKIPPED} more: skipped"] if len(shown.skipped) > SKIPPED else []
+    return "\n".join([shown.headline, *lines, *shown.lines, *skipped, *more])
+
+
+def table(result: Any) -> pd.DataFrame:
+    """Return a result as a pandas table."""
+    return dataframes.table(result)
+
+
+def _charts(result: object) -> Callable[[], str]:
+    return lambda: "".join(picture(chart) for chart in islice(charts_of(result), CHARTS))
+
+
+def _skipped(items: Sequence[Skipped]) -> tuple[str, ...]:
+    return tuple(f"{one.step}{f' ({one.side})' if one.side else ''}: {one.reason}" for one in items)
+
+
+# --- what each result shows -------------------------------------------------------------------------------------------
+
+
+@singledispatch
+def summary(result: object) -> ShownSummary:
+    """Return what is shown of a result."""
+    return ShownSummary(repr(result))
+
+
+@summary.register
+def _(result: FitResult) -> ShownSummary:
+    sides = tuple(result.cameras)
+    rows = [
+        (name, *(found[side].text if side in found else "–" for side in sides)) for name, found in by_side(result, {})
+    ]
+    for one in stereo_figures(result.stereo) if result.stereo is not None else ():
+        rows.append((one.name, one.text, *[""] * (len(sides) - 1)))
+    return ShownSummary(
+        f"Fit of {result.source}",
+        ("quantity", *(f"{side} (± one standard deviation)" for side in sides)),
+        tuple(rows),
+        tuple(f"Warning: {line}" for line in result.warnings),
+        _skipped(result.skipped),
+        _charts(result),
+    )
+
+
+@summary.register
+def _(result: ValidationResult) -> ShownSummary:
+    passed = sum(check.passed for check in result.checks)
+    rows = tuple(
+        (
+            one.side,
+            words.CHECK_NAMES[one.name],
+            one.capture,
+            f"{one.chi2:.4g}",
+            str(one.n),
+            f"{one.rms_relative_percent:.2g} %",
+            "passed" if one.passed else "failed",
+        )
+        for one in result.checks
+    )
+    return ShownSummary(
+        f"Validation of {result.source}: {passed} of {len(result.checks)} checks passed "
+        "(chi2 within its 99.9 % quantile)",
+        ("side", "check", "capture", "chi2", "n", "rms difference", "result"),
+        rows,
+        (),
+        _skipped(result.skipped),
+        _charts(result),
+    )
+
+
+@summary.register
+def _(result: DiagnosisResult) -> ShownSummary:
+    badge, _, sentence = words.headline(result)
+    rows = tuple(
+        (answers.effect_line(effect), f"{effect.probability:.3g}", ", ".join(_rivals(effect.alternatives)) or "none")
+        for effect in result.effects
+    )
+    held = result.held_out
+    lines = [law.statement for law in result.discovered]
+    if result.unexplained:
+        places = sorted({f"{measurement_title(item.measurement)} ({item.side})" for item in result.unexplained})
+        lines.append(f"Without a name so far: {', '.join(places)}.")
+    if held is not None and held.n:
+        lines.append(
+            f"Held-out captures: chi2 {held.chi2_before:.4g} before, {held.chi2_after:.4g} after, of n = {held.n}."
+        )
+    if result.next_capture:
+        lines.append(f"Next capture: {result.next_capture}")
+    return ShownSummary(
+        f"Diagnosis of {result.source}: {badge}. {sentence}",
+        ("effect", "probability", "alternatives"),
+        rows,
+        tuple(lines),
+        _skipped(result.skipped),
+        _charts(result),
+    )
+
+
+def _rivals(names: Sequence[str]) -> Iterator[str]:
+    yield from (name.replace("_", " ") for name in names)
+
+
+@summary.register
+def _(result: ComparisonResult) -> ShownSummary:
+    ordered = sorted(result.changes, key=lambda row: -row.significance_sigma)
+    rows = tuple(
+        (
+            one.side or "",
+            f"{one.title or one.name} {one.where}".strip(),
+            measured(one.a, one.a_std, one.unit),
+            measured(one.b, one.b_std, one.unit),
+            f"{one.significance_sigma:.1f}",
+            "changed" if one.changed else "",
+        )
+        for one in ordered
+    )
+    changed = sum(one.changed for one in result.changes) + sum(one.changed for one in result.projection)
+    return ShownSummary(
+        f"{result.a} and {result.b}: {changed} of {len(result.changes) + len(result.projection)} figures changed "
+        f"beyond {result.threshold_sigma:.1f} sigma (false-alarm rate {100 * result.false_alarm_rate:g} %)",
+        ("side", "quantity", "A", "B", "difference, sigma", ""),
+        rows,
+        result.instruments,
+        _skipped(result.skipped),
+    )
+
+
+@summary.register
+def _(result: RecordingSet) -> ShownSummary:
+    counted = Counter((capture.kind, capture.side) for capture in result.captures())
+    first = {(capture.kind, capture.side): capture for capture in reversed(result.captures())}
+
+    def pictures() -> str:
+        shown = [first[key] for key in list(counted)[:FRAMES]]
+        uris = [frame_picture(result.frame(one), result.camera(one.side), FRAME_PX) for one in shown]
+        return "".join(
+            f'<figure style="display:inline-block;margin:0.4em"><figcaption>{escape(one.id)}</figcaption>'
+            f'<img alt="{escape(one.id, quote=True)}" src="{uri}"></figure>'
+            for one, uri in zip(shown, uris, strict=True)
+        )
+
+    return ShownSummary(
+        f"Recording set {result.manifest.name or result.source}: {len(result.captures())} captures of "
+        f"{', '.join(result.sides)}",
+        ("kind", "side", "captures"),
+        tuple((kind, side, str(number)) for (kind, side), number in counted.items()),
+        tuple(f"Warning: {line}" for line in result.warnings),
+        pictures=pictures,
+    )
+
+
+@summary.register
+def _(result: Simulation) -> ShownSummary:
+    record = result.record
+    found, rows, cols = record.summary, *result.frame.shape
+
+    def pictures() -> str:
+        uri = photograph_data_uri(preview(result.frame, result.camera, result.white))
+        return f'<img alt="{escape(record.options.scene, quote=True)}" style="max-width:480px" src="{uri}">'
+
+    return ShownSummary(
+        f"Simulated frame of {record.options.scene} under {record.options.illuminant}: {cols} x {rows} px, "
+        f"{record.camera['cfa']}",
+        ("quantity", "value"),
+        (
+            ("exposure", f"{found.exposure_s:.4g} s"),
+            ("mean", f"{found.mean_electrons:.4g} e, {found.mean_dn:.4g} DN"),
+            ("SNR at the mean", f"{found.snr:.3g}"),
+            ("saturated pixels", f"{found.saturated_percent:.2g} %"),
+        ),
+        tuple(f"Warning: {line}" for line in record.lens_warnings),
+        pictures=pictures,
+    )
+
+
+@summary.register
+def _(result: History) -> ShownSummary:
+    drifted = sum(point.drifted for point in result.points)
+    return ShownSummary(
+        f"{result.title or result.figure} of {result.camera} over {len(result.points)} calibrations: {drifted} drifted",
+        ("calibration", "created (UTC)", "value", "difference, sigma", ""),
+        tuple(
+            (
+                one.calibration_id,
+                f"{one.created:%Y-%m-%d %H:%M}",
+                measured(one.value, one.std, result.unit),
+                "" if one.significance_sigma is None else f"{one.significance_sigma:.1f}",
+                "drifted" * one.drifted,
+            )
+            for one in result.points
+        ),
+        pictures=_charts(result),
+    )
+
+
+@summary.register
+def _(result: SealedPrediction) -> ShownSummary:
+    counted = Counter((side, number.quantity) for side, one in result.sides.items() for number in one.numbers)
+    skipped = tuple(line for one in result.sides.values() for line in _skipped(one.skipped))
+    rows = tuple((side, title(quantity), str(number)) for (side, quantity), number in counted.items())
+    return ShownSummary(f"Prediction of {result.plan}", ("side", "quantity", "numbers"), rows, skipped=skipped)
+
+
+@summary.register
+def _(result: TwinScore) -> ShownSummary:
+    sides = dict.fromkeys(effect.side for effect in result.effects)
+    return ShownSummary(
+        f"Prediction against {result.source}: chi2 {result.chi2:.4g} of n = {result.n}",
+        ("quantity", "n", "median deviation", "in 95 % intervals", "chi2 / n"),
+        tuple(
+            (
+                title(one.quantity),
+                str(one.n),
+                f"{one.median:.3g}{' %' if one.unit == '%' else ''}",
+                f"{100 * one.within_95_percent_interval:.1f} %",
+                f"{one.chi2 / one.n:.2f}",
+            )
+            for one in result.quantities
+        ),
+        tuple(f"{side}: {conclusion([e for e in result.effects if e.side == side])}" for side in sides),
+        _skipped(result.skipped),
+    )
+
+
+@summary.register
+def _(result: PipelineResult) -> ShownSummary:
+    parts = [summary(part) for part in (result.fit, result.validation, result.diagnosis) if part is not None]
+    first = parts[0] if parts else summary(result.recordings)
+    return ShownSummary(
+        ". ".join(part.headline for part in parts[::-1]) or first.headline,
+        first.headings,
+        first.rows,
+        (
+            *(line for part in parts for line in part.lines),
+            *((f"Report: {result.report}",) if result.report is not None else ()),
+        ),
+        tuple(dict.fromkeys(line for part in parts for line in part.skipped)),
+        _charts(result),
+    )
