@@ -13,7 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.colour_shift import COLOUR_FLOOR_PX
@@ -25,7 +26,6 @@ from lab.observables.screens.cell_borders import BORDER_FLOOR
 from lab.observables.screens.contrast import CONTRAST_FLOOR
 from lab.observables.screens.ghost import GHOST_FLOOR
 from lab.observables.screens.placement import place_pattern
-from mocks.former import ConcealedCamera, Plan
 from sim.camera import Cfa
 from sim.sensor import mosaic
 
