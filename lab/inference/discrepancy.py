@@ -1,15 +1,15 @@
 """Small physics that no list has: groups of disturbances, each of a state of the chain of light, with everyday scales.
 
 A group's disturbance is a Gaussian process along the coordinate of its state: linear between nodes, whose values have a
-squared-exponential kernel of unit variance and a correlation length of two nodes. Its columns H are the changes of the
-whole prediction by it, so that an unlisted blur moves edges and screens by one function. Where no law of `sim` has the
-state (noise by line, defective pixels, codes), the process acts on the observables of that state, along their own axis,
-as a share of their scale."""
+squared-exponential kernel of unit variance and a correlation length of two nodes (of the transmittance 15 nm). Its
+columns H are the changes of the whole prediction by it, so that an unlisted blur moves edges and screens by one
+function. Where no law of `sim` has the state (noise by line, defective pixels, codes), the process acts on the
+observables of that state, along their own axis, as a share of their scale."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh
@@ -27,10 +27,13 @@ from sim.spectrum import FloatArray
 _STEP = 0.01
 #: Correlation length of a process in nodes.
 _NODES_CORRELATED = 2.0
+#: Distance of the nodes of the transmittance, nm, and their correlation length in nodes: coatings ripple with periods
+#: of some tens of nm.
+_SPECTRAL_STEP_NM, _SPECTRAL_CORRELATED, _MOST_SPECTRAL = 10.0, 1.5, 48
 #: Correlation between two channels, and between two conditions, of one observable.
 _BETWEEN = 0.7
 #: Columns of a group that are kept, by what they may change at its largest scale: variances, in the numbers' noise.
-MOST_COLUMNS, LEAST_VARIANCE = 16, 1e-2
+MOST_COLUMNS, LEAST_VARIANCE = 24, 1e-2
 
 
 @dataclass(frozen=True)
@@ -161,6 +164,7 @@ class _Process:
     nodes: int
     unit: float = 1.0
     first: int = 0  # nodes before it are fixed
+    correlated: float = _NODES_CORRELATED
 
 
 def _columns(model: MeasurementModel, base: FloatArray, processes: Iterator[_Process]) -> Iterator[FloatArray]:
@@ -172,7 +176,7 @@ def _columns(model: MeasurementModel, base: FloatArray, processes: Iterator[_Pro
         table = np.column_stack(own)
         if table.any():
             x = np.arange(table.shape[1])
-            kernel = np.exp(-0.5 * np.square((x[:, None] - x) / _NODES_CORRELATED)) + 1e-6 * np.eye(len(x))
+            kernel = np.exp(-0.5 * np.square((x[:, None] - x) / process.correlated)) + 1e-6 * np.eye(len(x))
             yield table @ np.linalg.cholesky(kernel)
 
 
@@ -217,8 +221,9 @@ def _field(dataset: Dataset) -> Iterator[_Process]:
 def _spectral(dataset: Dataset) -> Iterator[_Process]:
     stated = [c.wavelength_nm for c in dataset.recordings.captures("narrowband", dataset.side)]
     low, high = (min(stated), max(stated)) if stated else (400.0, 700.0)
-    nodes = int(np.clip((high - low) / 20.0, 4, 24)) + 1
-    yield _curve("image", "wavelength", "mean", np.linspace(low, high, nodes))
+    nodes = int(np.clip((high - low) / _SPECTRAL_STEP_NM, 4, _MOST_SPECTRAL)) + 1
+    curve = _curve("image", "wavelength", "mean", np.linspace(low, high, nodes))
+    yield replace(curve, correlated=_SPECTRAL_CORRELATED)
 
 
 def _levels_e(dataset: Dataset) -> FloatArray:
@@ -272,7 +277,7 @@ def _on_observables(model: MeasurementModel, names: Sequence[str]) -> FloatArray
         if at:
             blocks = [model.blocks[k] for k in at]
             size, vectors = eigh(observable_kernel(*blocks))
-            kept = np.flatnonzero(size > 1e-3 * size[-1])[-3 * MOST_COLUMNS :]
+            kept = np.flatnonzero(size > 1e-3 * size[-1])[-2 * MOST_COLUMNS :]
             own = np.zeros((n, len(kept)))
             scale = np.concatenate([b.scale for b in blocks])
             where = np.concatenate([np.arange(n)[model.slices[k]] for k in at])

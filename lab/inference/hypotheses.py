@@ -165,14 +165,14 @@ class SetPrior:
 
     @cached_property
     def _log_totals(self) -> FloatArray:
-        """Log of the sum over all sets of k members of the products of their shares: elementary symmetric
-        polynomials."""
-        total = np.zeros(len(self.number))
-        total[0] = 1.0
-        for w in self.weight.values():
-            total[1:] += w * total[:-1]
+        """Log of the sum over all sets of k members of the products of their shares."""
         with np.errstate(divide="ignore"):
-            return np.asarray(np.log(total))
+            return np.asarray(np.log(symmetric(list(self.weight.values()), len(self.number) - 1)))
+
+    def scale(self, k: int) -> float:
+        """Return the prior of a set of k members over the product of their shares; 0 where there is no such set."""
+        total = float(self._log_totals[k])
+        return float(self.number[k] * np.exp(-total)) if np.isfinite(total) else 0.0
 
     def log(self, members: frozenset[str]) -> float:
         """Log prior probability of exactly this set; -inf of more members than `number` has."""
@@ -191,6 +191,15 @@ class SetPrior:
             raise ValueError(f"{len(sets)} sets of {k} hypotheses: draw from 20000 at most, of a toy's hypotheses")
         weight = np.array([np.prod([self.weight[m] for m in s]) for s in sets])
         return frozenset(sets[int(rng.choice(len(sets), p=weight / weight.sum()))])
+
+
+def symmetric(weights: Sequence[float], most: int) -> FloatArray:
+    """Return the elementary symmetric polynomials of degree 0 to `most`: sums over all sets of k of their products."""
+    total = np.zeros(most + 1)
+    total[0] = 1.0
+    for w in weights:
+        total[1:] += w * total[:-1]
+    return total
 
 
 def coordinates_of(hypotheses: Mapping[str, Hypothesis], state: State) -> list[tuple[str, int, Coordinate]]:

@@ -78,6 +78,15 @@ def read_table(table: Table, hypotheses: Mapping[str, Hypothesis]) -> Posterior:
             unlisted[table.groups[g]] = unlisted.get(table.groups[g], 0.0) + row.probability
         if not row.members and not row.unlisted:
             nothing += row.probability
+    for tail in table.tails:
+        for name in tail.members:
+            effects[name] = effects.get(name, 0.0) + tail.probability
+        for name, share in tail.effects.items():
+            effects[name] = effects.get(name, 0.0) + tail.probability * share
+        held_families = {hypotheses[name].family for name in tail.members}
+        for family in held_families | set(tail.families):
+            share = 1.0 if family in held_families else tail.families[family]
+            families[family] = families.get(family, 0.0) + tail.probability * share
     kinds: tuple[tuple[Kind, dict[str, float]], ...] = (
         ("effect", effects), ("family", families), ("unlisted", unlisted),
     )  # fmt: skip

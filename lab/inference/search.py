@@ -23,6 +23,7 @@ from lab.inference.hypotheses import (
     coordinates_of,
     moved,
     stacked,
+    symmetric,
 )
 from lab.inference.laplace import Laplace, bounds, correct_along, integrate, near_bound
 from lab.inference.model import (
@@ -155,10 +156,23 @@ class Row:
 
 
 @dataclass(frozen=True)
+class Tail:
+    """All sets of three or more members more than `members` of which the recordings say little, together: their
+    probability, and by hypothesis the share that holds it, by family the share that holds any of it."""
+
+    members: frozenset[str]
+    probability: float
+    effects: Mapping[str, float]
+    families: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class Table:
-    """All sets with their probabilities, likeliest first, and the fits of those that were refitted."""
+    """All sets with their probabilities, likeliest first, and the fits of those that were refitted. `tails`: larger
+    sets, which aren't listed one by one."""
 
     rows: tuple[Row, ...]
+    tails: tuple[Tail, ...]
     fits: Mapping[frozenset[str], FittedSet]
     groups: tuple[str, ...]
     log_evidence: float
@@ -172,7 +186,8 @@ class Table:
     @property
     def closed_form(self) -> float:
         """Probability of the sets of which the recordings say so little that the closed form is enough."""
-        return sum(r.probability for r in self.rows if not r.refitted and r.is_closed_form_enough)
+        listed = sum(r.probability for r in self.rows if not r.refitted and r.is_closed_form_enough)
+        return listed + sum(t.probability for t in self.tails)
 
     @property
     def is_undecided(self) -> bool:
@@ -343,6 +358,11 @@ class Search:
         if len(starts[0]) > 1 and all(alone.values()):
             other: State = {name: f.state[name] for name, f in alone.items() if f is not None}
             starts = [max((starts[0], other), key=self._log_density)]
+        for index in estimate.alternatives:
+            owner = signatures[index].owner
+            stands = self._as_it_stands.get((origin.members, owner))
+            if stands is not None:
+                starts = [max((starts[0], {**starts[0], owner: stands}), key=self._log_density)]
         if len(estimate.alternatives) == 1:
             owner = signatures[estimate.alternatives[0]].owner
             for index, c in self._near_alternatives(origin, owner, estimate.alternatives[0]):
@@ -550,6 +570,12 @@ class Search:
     def _by_alternative(self) -> dict[frozenset[str], dict[int, tuple[float, FloatArray]]]:
         return {}
 
+    @cached_property
+    def _as_it_stands(self) -> dict[tuple[frozenset[str], str], Point]:
+        """By origin and owner, the point of an alternative that is likeliest as it stands: of large changes, scaling by
+        the closed form's coefficient may be far off."""
+        return {}
+
     def _linearise(self, origin: FittedSet) -> None:
         """Estimate all sets with one, two or three members more than a fitted one: with all groups everyday, and with
         the likeliest of them unlisted where that matters."""
@@ -572,6 +598,15 @@ class Search:
                 owners.setdefault(s.owner, []).append(i)
         gains = {o: log_sum_exp([single[i][0] for i in own]) - float(np.log(len(own))) for o, own in owners.items()}
         if not unlisted:
+            for o, own in owners.items():
+                taken = {
+                    (i, point): z[k] - 0.5 * gram[k, k]
+                    for i in own
+                    for k, (point, _) in zip(signatures[i].columns, signatures[i].points, strict=True)
+                }
+                i, point = max(taken, key=lambda key: taken[key])
+                alternative = self.hypotheses[o].alternatives[signatures[i].index]
+                self._as_it_stands[origin.members, o] = alternative.points[point]
             self._by_alternative[origin.members] = single
             self.singles[origin.members] = gains
         best = {o: max(own, key=lambda i: single[i][0]) for o, own in owners.items()}
@@ -731,11 +766,41 @@ class Search:
                 log[key, frozenset()] = self._log_posterior(fit)
         open_ = {k: e for k, e in self.estimates.items() if k not in self.fits and self._is_near(e)}
         log |= {(k, frozenset()): e.log_posterior for k, e in open_.items()}
-        total = log_sum_exp(list(log.values()))
+        tails = {
+            k: self._tail(self.fits[k]) for k in self.singles if self._log_posterior(self.fits[k]) > top - FAR_BELOW
+        }
+        total = log_sum_exp([*log.values(), *(t.probability for t in tails.values())])
         enough = {k for k, e in self.estimates.items() if e.gain <= SILENT}
         rows = [Row(k, u, float(np.exp(v - total)), k in self.fits, k in enough) for (k, u), v in log.items()]
         rows.sort(key=lambda r: -r.probability)
-        return Table(tuple(rows), dict(self.fits), tuple(g.name for g in self.model.groups), total, len(self.fits))
+        shares = tuple(replace(t, probability=float(np.exp(t.probability - total))) for t in tails.values())
+        return Table(
+            tuple(rows), shares, dict(self.fits), tuple(g.name for g in self.model.groups), total, len(self.fits)
+        )
+
+    def _tail(self, origin: FittedSet) -> Tail:
+        """Return the tail of a linearised set, with the log of its evidence times prior as `probability`. The evidence
+        of silent hypotheses is taken as the product of those of each alone."""
+        gains = {n: g for n, g in self.singles[origin.members].items() if g <= SILENT}
+        weight = {n: float(self.prior.weight[n] * np.exp(g)) for n, g in gains.items()}
+        most = len(self.prior.number) - 1 - len(origin.members)
+        sizes = range(3, most + 1)
+        inside = float(np.prod([self.prior.weight[n] for n in origin.members]))
+        factor = {k: self.prior.scale(len(origin.members) + k) * inside for k in sizes}
+
+        def mass(without: Sequence[str]) -> float:
+            sums = symmetric([w for n, w in weight.items() if n not in without], max(most, 0))
+            return float(sum(factor[k] * sums[k] for k in sizes if k < len(sums)))
+
+        whole = mass(())
+        if whole <= 0.0:
+            return Tail(origin.members, -np.inf, {}, {})
+        families: dict[str, list[str]] = {}
+        for name in gains:
+            families.setdefault(self.hypotheses[name].family, []).append(name)
+        effects = {n: 1.0 - mass((n,)) / whole for n in gains}
+        held = {f: 1.0 - mass(names) / whole for f, names in families.items()}
+        return Tail(origin.members, origin.quick + float(np.log(whole)), effects, held)
 
 
 def _differ(one: FittedSet, other: FittedSet) -> bool:
