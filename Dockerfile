@@ -3,6 +3,7 @@ FROM python:3.11-slim
 RUN useradd --create-home calibench && mkdir /data && chown calibench /data
 WORKDIR /srv/calibench
 COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY calibench calibench
 COPY sim sim
 COPY drivers drivers
 COPY lab lab

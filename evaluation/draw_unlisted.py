@@ -2,7 +2,7 @@
 healthy ones.
 
 They are sealed and diagnosed as the cases of the other proof. What differs is what is drawn (`draw_unlisted`, here) and
-what counts (`evaluation.unlisted_score`)."""
+what counts (`evaluation.unlisted`)."""
 
 from __future__ import annotations
 

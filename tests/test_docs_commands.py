@@ -35,6 +35,7 @@ NOT_RUN = {
     "README.md": "CI runs make test; the first run is tests/lab/test_pipeline.py's",
     "docs/explanation/chain-of-light.md": "tests/lab/cli/test_cli.py simulates",
     "docs/explanation/diagnosis.md": "minutes; tests/lab/cli/test_cli.py saves a model and takes it as baseline",
+    "docs/explanation/evidence.md": "minutes; tests/lab/inference",
     "docs/explanation/examples/emva1288-ccd.md": "recordings of others; tests/test_real_recordings.py where they are",
     "docs/explanation/examples/flea3.md": "recordings of others; tests/test_real_recordings.py where they are",
     "docs/explanation/examples/low-pass-and-infrared-filter.md": "tests/lab/diagnose/test_example.py",

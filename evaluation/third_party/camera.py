@@ -61,7 +61,7 @@ def draw_camera(rng: np.random.Generator) -> DrawnCamera:
 
 
 @dataclass
-class _Session:
+class _ThirdPartySession:
     """Captures and frames in the order in which they are taken."""
 
     camera: DrawnCamera
@@ -92,7 +92,7 @@ class _Session:
 def record_sensor(name: str, camera: DrawnCamera, sensor: SimulatedSensor, rng: np.random.Generator) -> RecordingSet:
     """Take darks at three exposures and flats at eight to eleven levels, three to six of each; hot pixels, dark frames
     after the bright ones, or faint flats where the sensor's plan has them."""
-    session = _Session(camera, [], {})
+    session = _ThirdPartySession(camera, [], {})
     repeats, levels = int(rng.integers(4, 7)), int(rng.integers(8, 12))
     dark_e_per_s = np.full((camera.rows, camera.cols), camera.dark_e_per_s)
     if sensor.plan == "hot pixels":
@@ -124,7 +124,7 @@ def record_sensor(name: str, camera: DrawnCamera, sensor: SimulatedSensor, rng: 
 def record_optics(name: str, camera: DrawnCamera, optics: SimulatedOptics, rng: np.random.Generator) -> RecordingSet:
     """Take darks, flats, and slanted edges along rows and columns under light of 550 nm, through a lens at f/8 of 400
     mm, by which light falls off by less than 0.1 %."""
-    session = _Session(camera, [], {})
+    session = _ThirdPartySession(camera, [], {})
     rows, cols = camera.rows, camera.cols
 
     def expose(kind: str, light_e: FloatArray, exposure_s: float, **keys: Any) -> None:

@@ -19,8 +19,8 @@ import numpy as np
 from evaluation.third_party import galsim_models as by_galsim
 from evaluation.third_party import pyxel_models as by_pyxel
 from evaluation.third_party.camera import DrawnCamera, draw_camera, record_optics, record_sensor
-from evaluation.third_party.models import Checked, SimulatedOptics, SimulatedSensor
-from evaluation.third_party.score import Diagnosed, Size
+from evaluation.third_party.models import SimulatedOptics, SimulatedSensor, SimulatorCheck
+from evaluation.third_party.score import Diagnosed, ScoredSize
 from lab.diagnose import diagnose
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import NamedEffect
@@ -47,12 +47,12 @@ class Source:
 SOURCES: dict[str, Source] = {
     "healthy_sensor": Source("Pyxel", lambda rng, camera: SimulatedSensor(), None),
     "charge_transfer_inefficiency": Source(
-        "Pyxel", by_pyxel.Transfer.draw, "charge_transfer_inefficiency", "hot_pixels"
+        "Pyxel", by_pyxel.PyxelTransfer.draw, "charge_transfer_inefficiency", "hot_pixels"
     ),
-    "persistence": Source("Pyxel", by_pyxel.Persistence.draw, "persistence"),
+    "persistence": Source("Pyxel", by_pyxel.PyxelPersistence.draw, "persistence"),
     "inter_pixel_capacitance": Source("Pyxel", by_pyxel.Capacitance.draw, "inter_pixel_capacitance"),
     "nonlinearity": Source("Pyxel", by_pyxel.Bend.draw, "nonlinearity"),
-    "amplifier_crosstalk": Source("Pyxel", by_pyxel.Crosstalk.draw, "amplifier_crosstalk"),
+    "amplifier_crosstalk": Source("Pyxel", by_pyxel.PyxelCrosstalk.draw, "amplifier_crosstalk"),
     "excess_noise": Source("Pyxel", by_pyxel.Avalanche.draw, "excess_noise"),
     "reading_order_noise": Source("Pyxel", by_pyxel.PinkNoise.draw, "reading_order_noise"),
     "brighter_fatter": Source("GalSim", by_galsim.Silicon.draw, "brighter_fatter"),
@@ -68,7 +68,7 @@ SOURCES: dict[str, Source] = {
 }
 
 
-def draw_set(source: str, number: int) -> tuple[RecordingSet, dict[str, float], Checked]:
+def draw_set(source: str, number: int) -> tuple[RecordingSet, dict[str, float], SimulatorCheck]:
     """Return set `number` of a source, the truth by the library's parameters, and the check of its simulator."""
     rng = np.random.default_rng([SEED, list(SOURCES).index(source), number])
     camera = draw_camera(rng)
@@ -115,7 +115,7 @@ def diagnose_set(source: str, number: int) -> Diagnosed:
     return replace(undiagnosed, verdict=result.verdict, names=names, sizes=sizes, cpu_s=cpu_s)
 
 
-def _sizes(named: NamedEffect, truth: dict[str, float]) -> Iterator[Size]:
+def _sizes(named: NamedEffect, truth: dict[str, float]) -> Iterator[ScoredSize]:
     for name, value in truth.items():
         found = named.parameters.get(name)
         if found is None:
@@ -127,11 +127,11 @@ def _sizes(named: NamedEffect, truth: dict[str, float]) -> Iterator[Size]:
             low, high = (turn * found.value + side * SIGMAS * found.std for side in (-1.0, 1.0))
         else:
             continue
-        yield Size(name, value, turn * found.value, low, high)
+        yield ScoredSize(name, value, turn * found.value, low, high)
 
 
 def _kept(file: Path) -> Iterator[Diagnosed]:
     if file.exists():
         for line in file.read_text(encoding="utf-8").splitlines():
             text = json.loads(line)
-            yield Diagnosed(**text | {"sizes": tuple(Size(**size) for size in text["sizes"])})
+            yield Diagnosed(**text | {"sizes": tuple(ScoredSize(**size) for size in text["sizes"])})

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import gamma, kv
 
 from evaluation.third_party.camera import F_NUMBER, WAVELENGTH_NM, DrawnCamera
-from evaluation.third_party.models import Checked, SimulatedOptics, SimulatedSensor
+from evaluation.third_party.models import SimulatedOptics, SimulatedSensor, SimulatorCheck
 from sim.spectrum import FloatArray
 
 #: Steps in which a flat is collected, pixel borders being moved after each by the charge that is there.
@@ -52,7 +52,7 @@ class Silicon(SimulatedSensor):
             image.array[:] += rng.poisson(wide_e / STEPS * sensor.calculate_pixel_areas(image).array)
         return np.asarray(image.array[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX], float)
 
-    def check(self) -> Checked:
+    def check(self) -> SimulatorCheck:
         """Charge is conserved: the variance that a pixel lacks is the covariance of its neighbours, in sum, so that
         blocks of 8 x 8 pixels have the variance of their electrons but for a quarter of it at their rims."""
         mean_e, rng = 0.8 * self.full_well_e, np.random.default_rng(1)
@@ -60,7 +60,7 @@ class Silicon(SimulatedSensor):
         blocks = drawn.reshape(16, 8, 16, 8).sum(axis=(1, 3))
         one, many = np.var(drawn) / np.mean(drawn), np.var(blocks) / np.mean(blocks)
         tolerance = 3.0 * np.sqrt(2.0 / blocks.size) + 0.25 * abs(1.0 - float(one))
-        return Checked(1.0, float(many), tolerance)
+        return SimulatorCheck(1.0, float(many), tolerance)
 
 
 @dataclass
@@ -83,7 +83,7 @@ class Spread(SimulatedOptics):
         drawn = galsim.Convolve([self.profile(pitch_um), light], gsparams=params)
         return np.asarray(drawn.drawImage(nx=size, ny=size, scale=1.0, dtype=float).array)
 
-    def check(self) -> Checked:
+    def check(self) -> SimulatorCheck:
         """The transfer at 0.25 cy/px of a drawn point, without the pixel."""
         image = (
             self.profile(self.pitch_um)
@@ -94,7 +94,7 @@ class Spread(SimulatedOptics):
         frequency_px = np.fft.fftfreq(POINT_PX, POINT_STEP_PX)
         at = int(np.argmin(np.abs(frequency_px - 0.25)))
         asked = float(self.transfer(np.array([frequency_px[at] / self.pitch_um]))[0])
-        return Checked(asked, float(along[at]), TRANSFORM_ERROR)
+        return SimulatorCheck(asked, float(along[at]), TRANSFORM_ERROR)
 
 
 def _airy(pitch_um: float) -> Any:

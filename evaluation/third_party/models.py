@@ -14,7 +14,7 @@ Kind = Literal["electronic", "optical"]
 
 
 @dataclass(frozen=True)
-class Checked:
+class SimulatorCheck:
     """The size of an effect in a simulator's own output, by a few lines of numpy, beside what was asked for.
 
     tolerance : of the difference, three standard deviations or the simulator's documented error
@@ -49,10 +49,10 @@ class SimulatedSensor:
         """Return the signal (rows, cols) in electrons, before read noise, of what was collected."""
         return electrons
 
-    def check(self) -> Checked:
+    def check(self) -> SimulatorCheck:
         """Measure the effect in the simulator's output; of a healthy sensor the variance over the mean, which is 1."""
         drawn = self.read(self.collect(np.full((200, 200), 1000.0), 0.01, rng := np.random.default_rng(1)), rng)
-        return Checked(1.0, float(np.var(drawn) / np.mean(drawn)), 3.0 * np.sqrt(2.0 / drawn.size))
+        return SimulatorCheck(1.0, float(np.var(drawn) / np.mean(drawn)), 3.0 * np.sqrt(2.0 / drawn.size))
 
 
 @dataclass
@@ -68,6 +68,6 @@ class SimulatedOptics:
         """Return the image (size, size) of a half plane of light of level 1, integrated over pixels."""
         raise NotImplementedError
 
-    def check(self) -> Checked:
+    def check(self) -> SimulatorCheck:
         """Compare the transfer at one frequency with its closed form."""
         raise NotImplementedError

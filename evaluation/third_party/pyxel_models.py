@@ -24,7 +24,7 @@ from pyxel.models.charge_measurement.utils_amplifier_crosstalk import crosstalk_
 from pyxel.models.charge_transfer.utils_cdm import run_cdm_parallel, run_cdm_serial
 
 from evaluation.third_party.camera import DrawnCamera
-from evaluation.third_party.models import Checked, SimulatedSensor
+from evaluation.third_party.models import SimulatedSensor, SimulatorCheck
 from sim.spectrum import FloatArray
 
 #: Volts an electron, by which Pyxel's signals are read back.
@@ -46,7 +46,7 @@ def _detector(rows: int, cols: int, channels: Channels | None = None) -> CMOS:
 
 
 @dataclass
-class Transfer(SimulatedSensor):
+class PyxelTransfer(SimulatedSensor):
     """Charge transfer inefficiency by Short's charge distortion model (CDM), one species, a cloud in proportion."""
 
     axis: int = 0
@@ -55,7 +55,7 @@ class Transfer(SimulatedSensor):
     full_well_e: float = 1e4
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> Transfer:
+    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> PyxelTransfer:
         axis, loss, release = int(rng.integers(2)), float(rng.uniform(2e-4, 8e-4)), float(rng.uniform(0.6, 3.0))
         names = ("parallel_ppm", "release_px") if axis == 0 else ("serial_ppm", "serial_release_px")
         truth = dict(zip(names, (1e6 * loss, release), strict=True))
@@ -74,17 +74,18 @@ class Transfer(SimulatedSensor):
         )  # fmt: skip
         return np.asarray(out)
 
-    def check(self) -> Checked:
-        """Of one bright pixel after n transfers all pixels behind hold n loss / (1 + n loss / b) of it."""
+    def check(self) -> SimulatorCheck:
+        """Of one bright pixel after n transfers the traps keep g b / (1 + g) once it has gone on, g = n loss / b: all n
+        transfers act at once in this model, which takes a share g of that from n loss."""
         frame, n = np.zeros((100, 100)), 60
         frame[n, n] = 1000.0
-        kept = self._clock(frame)[n, n] / 1000.0
-        grown = n * self.loss / (b := np.exp(-1.0 / self.release_px))
-        return Checked(n * self.loss, 1.0 - float(kept), 1e-3 + n * self.loss * (1.0 - 1.0 / (1.0 + grown)) + 0.0 * b)
+        read = float(self._clock(frame)[n, n]) / 1000.0
+        at_once = n * self.loss / np.exp(-1.0 / self.release_px)
+        return SimulatorCheck(n * self.loss / (1.0 + at_once), 1.0 - read, 1e-6)
 
 
 @dataclass
-class Persistence(SimulatedSensor):
+class PyxelPersistence(SimulatedSensor):
     """Simple persistence of one kind of traps without a capacity: in an exposure T they fill or empty by T / tau."""
 
     share: float = 0.02
@@ -92,7 +93,7 @@ class Persistence(SimulatedSensor):
     trapped: FloatArray | None = None
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> Persistence:
+    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> PyxelPersistence:
         return cls({}, "dark after bright", float(rng.uniform(0.01, 0.05)), float(rng.uniform(10.0, 40.0)))
 
     def collect(self, mean_e: FloatArray, exposure_s: float, rng: np.random.Generator) -> FloatArray:
@@ -104,14 +105,14 @@ class Persistence(SimulatedSensor):
         )  # fmt: skip
         return np.asarray(electrons)
 
-    def check(self) -> Checked:
+    def check(self) -> SimulatorCheck:
         """After a frame of 10,000 e in T the traps hold share T / tau of it, and a dark frame in T gets T / tau of
         that."""
-        fresh, exposure_s = Persistence({}, self.plan, self.share, self.release_s), 1.0
+        fresh, exposure_s = PyxelPersistence({}, self.plan, self.share, self.release_s), 1.0
         fresh.collect(np.full((200, 200), 1e4), exposure_s, rng := np.random.default_rng(1))
         got = float(np.mean(fresh.collect(np.zeros((200, 200)), exposure_s, rng)))
         asked = 1e4 * self.share * (exposure_s / self.release_s) ** 2
-        return Checked(asked, got, 3.0 * asked * 1e-2 / 200.0 + 1e-6)
+        return SimulatorCheck(asked, got, 3.0 * asked * 1e-2 / 200.0 + 1e-6)
 
 
 @dataclass
@@ -140,13 +141,13 @@ class Capacitance(SimulatedSensor):
         simple_ipc(detector, self.coupling, self.corner, self.unequal)
         return np.asarray(detector.signal.array, float) / VOLT_PER_E
 
-    def check(self) -> Checked:
+    def check(self) -> SimulatorCheck:
         """The pixel beside a bright one has the coupling in the row; the transform is good to 1e-3 of that."""
         frame = np.zeros((64, 64))
         frame[32, 32] = 1e4
         read = self.read(frame, np.random.default_rng(1))
         asked = float(ipc_kernel(self.coupling, self.corner, self.unequal)[1, 0])
-        return Checked(self.coupling + self.unequal, float(read[32, 33]) / 1e4, 1e-3 * abs(asked) + 1e-6)
+        return SimulatorCheck(self.coupling + self.unequal, float(read[32, 33]) / 1e4, 1e-3 * abs(asked) + 1e-6)
 
 
 @dataclass
@@ -164,21 +165,21 @@ class Bend(SimulatedSensor):
     def read(self, electrons: FloatArray, rng: np.random.Generator) -> FloatArray:
         return np.asarray(compute_poly_linearity(electrons, [0.0, 1.0, self.quadratic / self.full_well_e]))
 
-    def check(self) -> Checked:
+    def check(self) -> SimulatorCheck:
         """At half of full well the signal departs by half of the bend."""
         half = np.full((2, 2), 0.5 * self.full_well_e)
         departure = float(self.read(half, np.random.default_rng(1))[0, 0] / half[0, 0]) - 1.0
-        return Checked(0.5 * self.quadratic, departure, 1e-9)
+        return SimulatorCheck(0.5 * self.quadratic, departure, 1e-9)
 
 
 @dataclass
-class Crosstalk(SimulatedSensor):
+class PyxelCrosstalk(SimulatedSensor):
     """DC crosstalk of two amplifiers, each of which reads half of the columns in the same direction."""
 
     coupling: float = 0.005
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> Crosstalk:
+    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> PyxelCrosstalk:
         coupling = float(rng.uniform(0.004, 0.012)) * float(rng.choice([-1.0, 1.0]))
         return cls({"share_percent": 100.0 * coupling}, "usual", coupling)
 
@@ -190,11 +191,11 @@ class Crosstalk(SimulatedSensor):
         matrix = np.array([[0.0, self.coupling], [self.coupling, 0.0]])
         return np.asarray(crosstalk_signal_dc(electrons.copy(), matrix, channels, electrons.shape))
 
-    def check(self) -> Checked:
+    def check(self) -> SimulatorCheck:
         """A bright pixel has a ghost at the same place of the other half."""
         frame = np.zeros((8, 16))
         frame[3, 2] = 1e4
-        return Checked(self.coupling, float(self.read(frame, np.random.default_rng(1))[3, 10]) / 1e4, 1e-9)
+        return SimulatorCheck(self.coupling, float(self.read(frame, np.random.default_rng(1))[3, 10]) / 1e4, 1e-9)
 
 
 @dataclass
@@ -222,10 +223,10 @@ class Avalanche(SimulatedSensor):
         avalanche.avalanche_gain(detector, excess_noise_factor=self.excess, seed=int(rng.integers(2**31)))
         return np.nan_to_num(np.asarray(out["multiplied"]))
 
-    def check(self) -> Checked:
+    def check(self) -> SimulatorCheck:
         """The variance over the mean is the factor."""
         drawn = self.collect(np.full((200, 200), 1000.0), 0.01, np.random.default_rng(1))
-        return Checked(
+        return SimulatorCheck(
             self.excess, float(np.var(drawn) / np.mean(drawn)), 3.0 * self.excess * np.sqrt(2.0 / drawn.size)
         )
 
@@ -254,9 +255,9 @@ class PinkNoise(SimulatedSensor):
         law(self.detector, std=self.std_e, seed=seed)
         return np.asarray(self.detector.signal.array, float) / VOLT_PER_E
 
-    def check(self) -> Checked:
+    def check(self) -> SimulatorCheck:
         """The standard deviation over several frames is the one that was asked for; slow waves leave a fifth open."""
         fresh = PinkNoise({}, "usual", self.std_e, self.alternating)
         rng = np.random.default_rng(1)
         drawn = np.array([fresh.read(np.full((96, 128), 1000.0), rng) for _ in range(20)])
-        return Checked(self.std_e, float(np.sqrt(np.mean(np.square(drawn - 1000.0)))), 0.2 * self.std_e)
+        return SimulatorCheck(self.std_e, float(np.sqrt(np.mean(np.square(drawn - 1000.0)))), 0.2 * self.std_e)

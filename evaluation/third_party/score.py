@@ -11,7 +11,7 @@ from sim.effects.library import effect
 
 
 @dataclass(frozen=True)
-class Size:
+class ScoredSize:
     """A parameter of a rightly named effect, beside the simulator's. `low`, `high`: two standard deviations, or the
     interval that is reported."""
 
@@ -45,7 +45,7 @@ class Diagnosed:
     is_checked: bool
     verdict: str
     names: dict[str, float]
-    sizes: tuple[Size, ...]
+    sizes: tuple[ScoredSize, ...]
     cpu_s: float
     also: str | None = None
 

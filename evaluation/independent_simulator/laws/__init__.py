@@ -61,6 +61,7 @@ from evaluation.independent_simulator.laws.imaging import (
     SeeingLaw,
     SphericalAberrationLaw,
     TrefoilLaw,
+    TurbulentAirLaw,
     VibrationBlurLaw,
 )
 from evaluation.independent_simulator.laws.readout import (
@@ -158,6 +159,7 @@ LISTED: tuple[type[Law], ...] = (
     ColouredReadNoiseLaw,
     MicrolensAngleLaw,
     TrefoilLaw,
+    TurbulentAirLaw,
     LineGainLaw,
     PinkNoiseLaw,
     ChargeTransferLaw,

@@ -244,27 +244,37 @@ class HaloLaw(Law):
 
 
 class SeeingLaw(Law):
-    """Turbulent air blurs long exposures: of a full width at half maximum of `strength`. Variants: Moffat's profile of
-    exponent 2.5; of 3.5; Kolmogorov's spectrum, exp(-(f / f0)^(5/3))."""
+    """Light spreads into wide wings: of a full width at half maximum of `strength`. Variants: Moffat's profile of
+    exponent 2.5; of 3.5."""
 
     name, effect = "seeing", "moffat_blur"
-    variants, unit, nominal, limits, power, shown_by = 3, "um", 1.5, (0.2, 12.0), 1.7, OPTICAL
+    variants, unit, nominal, limits, power, shown_by = 2, "um", 1.5, (0.2, 12.0), 1.7, OPTICAL
 
     def spectral_transfer(self, frequency_cy_um: Array, wavelength_um: float) -> Array:
-        f = np.asarray(frequency_cy_um, float)
-        if self.variant == 2:  # FWHM 0.976 wavelength / r0, exponent 3.44 (wavelength f / r0)^(5/3)
-            return np.exp(-3.44 * (self.strength / 0.976 * f) ** (5.0 / 3.0))
         exponent = (2.5, 3.5)[self.variant]
         core = self.strength / (2.0 * np.sqrt(2.0 ** (1.0 / exponent) - 1.0))
-        x = 2.0 * np.pi * core * np.maximum(f, 1e-9)
+        x = 2.0 * np.pi * core * np.maximum(np.asarray(frequency_cy_um, float), 1e-9)
         # the Bessel functions of order 3/2 and 5/2 are elementary
         return (1.0 + x + (x * x / 3.0 if self.variant == 1 else 0.0)) * np.exp(-x)
 
     def library_parameters(self) -> dict[str, float]:
-        if self.variant == 2:
-            return {}
         exponent = (2.5, 3.5)[self.variant]
         return {"radius_um": self.strength / (2.0 * np.sqrt(2.0 ** (1.0 / exponent) - 1.0)), "exponent": exponent}
+
+
+class TurbulentAirLaw(Law):
+    """Turbulent air blurs long exposures: of a full width at half maximum of `strength`, 0.976 wavelength over Fried's
+    length r0, by Kolmogorov's structure function 6.88 (r / r0)^(5/3)."""
+
+    name = effect = "turbulent_air"
+    variants, unit, nominal, limits, power, shown_by = 1, "um", 1.5, (0.2, 12.0), 5.0 / 3.0, OPTICAL
+
+    def spectral_transfer(self, frequency_cy_um: Array, wavelength_um: float) -> Array:
+        apart = self.strength / 0.976 * np.asarray(frequency_cy_um, float)  # of the pupils, over r0
+        return np.exp(-0.5 * 6.88 * apart ** (5.0 / 3.0))
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"width_um": self.strength}
 
 
 class PixelApertureLaw(Law):

@@ -117,7 +117,6 @@ def misstated_levels(fit: CameraFit | None) -> tuple[InconsistentLevel, ...]:
 
 
 # Relative standard deviations.
-LEVEL_FLOOR = 1.0e-4  # of a level, common to its repeats: nonlinearity of a linear camera
 READING_COLOUR_STD = 5e-4  # of a radiometer's reading in one channel: its noise by wavelength
 RADIOMETER_STD = 0.002  # of a radiometer's reading, common to the channels; the most that narrowband readings may have
 
@@ -232,7 +231,7 @@ def _of_readings(
 
 def _level_covariance(dataset: Dataset, groups: list[list[Any]], points: list[Any], signal: FloatArray) -> FloatArray:
     """Covariance (n, n) of flat frames' means, DN^2: shot and read noise, the lamp's repeatability (common to a frame's
-    channels), and floor and rounding (common to repeats)."""
+    channels), and rounding (common to repeats)."""
     noise = dataset.noise
     pixels = np.array([dataset.levels(c).pixels[channel] for c, channel, *_ in points])
     group_of = {c.id: i for i, group in enumerate(groups) for c in group}
@@ -240,7 +239,6 @@ def _level_covariance(dataset: Dataset, groups: list[list[Any]], points: list[An
     channel_of = np.array([channel for _, channel, *_ in points])
     repeats = (group[:, None] == group) & (channel_of[:, None] == channel_of)
     covariance = np.diag((noise.gain * signal + noise.read_dn**2) / pixels)
-    covariance += repeats * np.outer(signal, signal) * LEVEL_FLOOR**2
     rounding = noise.rounding_std_dn(signal)
     covariance += repeats * np.outer(rounding, rounding)
     same = np.array([[a[0].id == b[0].id for b in points] for a in points])

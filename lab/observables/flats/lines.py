@@ -16,7 +16,6 @@ from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
-LINE_FLOOR = 1e-4  # relative standard deviation of a step beside noise
 #: Where the areas of two read-outs may meet, as shares of a side.
 MEETING = (0.25, 0.5, 0.75)
 LEAST_LINES = 8  # least side of a plane of the mosaic, lines: half of them determine the light's slope
@@ -55,12 +54,12 @@ def measure_flat_lines(dataset: Dataset) -> Observable:
             least = float(np.sqrt((dataset.noise.prnu**2 + of_dark) / image.shape[axis] + shot))
             for share, value, std, size in _steps(line, period, least):
                 values.append(value)
-                whole.append((std**2 + LINE_FLOOR**2, shot * size))
+                whole.append((std**2, shot * size))
                 labels.append(Label(share * len(line), name, f"{name} {share * len(line):.0f}", members, held_out))
             subtracted += [found[1] for found in _steps(with_dark - line, period, least)]
             value, std = _stripes(line, period, least)
             values.append(value)
-            whole.append((std**2 + LINE_FLOOR**2, shot * 4.0 / len(line)))
+            whole.append((std**2, shot * 4.0 / len(line)))
             labels.append(Label(0.0, name, f"even and odd {name}s", members, held_out))
             subtracted.append(_stripes(with_dark - line, period, least)[0])
     covariance = np.diag([total for total, _ in whole])

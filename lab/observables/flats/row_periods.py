@@ -12,7 +12,6 @@ from lab.errors import NotDetermined
 from lab.observables.darks.readout import OFFSETS_STD, dark_readout
 from lab.observables.dataset import Dataset
 from lab.observables.flats.images import collect_rows, flats, without_dark
-from lab.observables.flats.lines import LINE_FLOOR
 from lab.observables.noise.robust import median_std
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import COLLECTED, acting
@@ -103,7 +102,7 @@ def measure_row_periods(dataset: Dataset) -> Observable:
             values.append(rows.means(line))
             own.append(shot2)
             subtracted = OFFSETS_STD * rows.means(with_dark - line)
-            shared.append(row2 - shot2 + np.square(subtracted) + LINE_FLOOR**2)
+            shared.append(row2 - shot2 + np.square(subtracted))
             name = "row" if step == 1 else f"row, {('even', 'odd')[first]} columns"
             labels += [Label(float(k), "all", f"{name} {k}", members, held_out) for k in range(rows.period)]
     # the means lack their own mean: of 48 numbers, each has 2 % less variance than is said here

@@ -8,7 +8,14 @@ import pytest
 
 from evaluation.draw import recordings_of
 from evaluation.independent_simulator import ConcealedCamera, Law, Plan
-from evaluation.independent_simulator.laws import AstigmatismLaw, ChargeDiffusionLaw, ComaLaw, SeeingLaw, TrefoilLaw
+from evaluation.independent_simulator.laws import (
+    AstigmatismLaw,
+    ChargeDiffusionLaw,
+    ComaLaw,
+    SeeingLaw,
+    TrefoilLaw,
+    TurbulentAirLaw,
+)
 from lab.diagnose import diagnose
 
 pytestmark = pytest.mark.timeout(300)
@@ -18,6 +25,7 @@ STRONG: tuple[Law, ...] = (
     TrefoilLaw(0.3, 1, 9),
     SeeingLaw(2.0, 0, 9),
     SeeingLaw(2.0, 1, 9),
+    TurbulentAirLaw(2.0, 0, 9),
     # the likest laws: of an odd path error, of an even one, and of a Gaussian blur
     ComaLaw(0.4, 0, 9),
     AstigmatismLaw(0.3, 0, 9),

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from evaluation.third_party.camera import BLACK_DN, draw_camera, record_sensor
-from evaluation.third_party.models import Checked, SimulatedSensor
-from evaluation.third_party.score import Diagnosed, Size, table
+from evaluation.third_party.models import SimulatedSensor, SimulatorCheck
+from evaluation.third_party.score import Diagnosed, ScoredSize, table
 from tests.peers import missing
 
 ONE = Diagnosed(
     "persistence", "Pyxel", "persistence", 1, asked=0.1, measured=0.1, is_checked=True, verdict="explained",
-    names={"persistence": 0.99}, sizes=(Size("share_percent", 2.0, 2.1, 1.9, 2.3),), cpu_s=3.0,
+    names={"persistence": 0.99}, sizes=(ScoredSize("share_percent", 2.0, 2.1, 1.9, 2.3),), cpu_s=3.0,
 )  # fmt: skip
 
 
 def test_names_of_the_effect_and_its_family_are_right_and_others_are_second_names() -> None:
     family = replace(ONE, set=2, names={"memory_of_the_last_frame": 0.97}, sizes=())
     wrong = replace(
-        ONE, set=3, names={"persistence": 0.99, "source_drift": 0.96}, sizes=(Size("x", 2.0, 3.0, 2.5, 3.5),)
+        ONE, set=3, names={"persistence": 0.99, "source_drift": 0.96}, sizes=(ScoredSize("x", 2.0, 3.0, 2.5, 3.5),)
     )
     unlike = replace(ONE, set=4, is_checked=False, names={})
     assert [one.is_named for one in (ONE, family, wrong)] == [True, True, True]
@@ -31,8 +31,8 @@ def test_names_of_the_effect_and_its_family_are_right_and_others_are_second_name
 
 
 def test_a_simulator_that_errs_by_more_than_its_tolerance_is_not_right() -> None:
-    assert Checked(1.0, 1.02, 0.03).is_right
-    assert not Checked(1.0, 1.04, 0.03).is_right
+    assert SimulatorCheck(1.0, 1.02, 0.03).is_right
+    assert not SimulatorCheck(1.0, 1.04, 0.03).is_right
 
 
 def test_a_healthy_session_has_the_drawn_gain_and_noise() -> None:
