@@ -15,7 +15,7 @@ from evaluation.own_chain import healthy_session
 from lab.diagnose import diagnose
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet, read
-from lab.inference.check import Checked, check_held_out, passes
+from lab.inference.check import HeldOutCheck, check_held_out, passes
 from lab.inference.posterior import Posterior, Verdict, healthy_nothing, read_table, verdict
 from lab.inference.recordings import measure_side, search_side
 from lab.inference.search import Table
@@ -39,7 +39,7 @@ class Outcome:
     said: Verdict
     posterior: Posterior
     table: Table
-    checked: tuple[Checked, ...]
+    checked: tuple[HeldOutCheck, ...]
     least_nothing: float
     summaries_s: float
     search_s: float

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 from lab.errors import Cancelled, InputError
-from lab.shown import Shown
+from lab.shown import Displayable
 from sim.memory import return_freed_memory
 
 if TYPE_CHECKING:
@@ -177,7 +177,7 @@ Capturer = Callable[[CaptureRequest, "Callable[[CaptureProgress], None]"], str]
 
 
 @dataclass(frozen=True, repr=False)  # an IPython prompt prefers a dataclass's own text
-class PipelineResult(Shown):
+class PipelineResult(Displayable):
     """What a pipeline found; None for what its goal doesn't need."""
 
     recordings: RecordingSet

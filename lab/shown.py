@@ -35,7 +35,7 @@ def present_with(load: Callable[[], Presenter]) -> None:
     _load = load
 
 
-class Shown:
+class Displayable:
     """Base of what shows itself: IPython and Jupyter call these methods."""
 
     def _repr_html_(self) -> str | None:
@@ -45,7 +45,7 @@ class Shown:
         printer.text(repr(self) if _load is None or cycle else _load().text(self))
 
 
-class Tabular(Shown):
+class Tabular(Displayable):
     """Base of what is a table, too."""
 
     def to_dataframe(self) -> pd.DataFrame:

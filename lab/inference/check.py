@@ -57,7 +57,7 @@ SHARE, MOST_ROWS = 0.95, 6
 
 
 @dataclass(frozen=True)
-class Checked:
+class HeldOutCheck:
     """One observable's held-out numbers against the prediction: chi2 of n numbers, and the probability of as large a
     chi2, both means over the table."""
 
@@ -68,7 +68,7 @@ class Checked:
     contradicts: bool = False
 
 
-def check_held_out(problem: SideProblem, search: Search, table: Table) -> tuple[Checked, ...]:
+def check_held_out(problem: SideProblem, search: Search, table: Table) -> tuple[HeldOutCheck, ...]:
     """Return p(y* | y) of the whole table, observable by observable; by Holm's procedure, which contradict it."""
     rows = _likeliest(table)
     if not problem.held_out or not rows:
@@ -89,7 +89,7 @@ def check_held_out(problem: SideProblem, search: Search, table: Table) -> tuple[
     p = weight @ chdtrc(counts, chi2)
     against = holm(p, RATE)
     found = zip(names, counts, weight @ chi2, p, against, strict=True)
-    return tuple(Checked(name, int(n), float(c), float(q), bool(no)) for name, n, c, q, no in found)
+    return tuple(HeldOutCheck(name, int(n), float(c), float(q), bool(no)) for name, n, c, q, no in found)
 
 
 def holm(p: FloatArray, rate: float) -> np.ndarray:
@@ -161,6 +161,6 @@ def _blocks_used(problem: SideProblem) -> int:
     return len(problem.measured.blocks)
 
 
-def passes(checked: Sequence[Checked]) -> bool:
+def passes(checked: Sequence[HeldOutCheck]) -> bool:
     """Whether no observable contradicts."""
     return not any(c.contradicts for c in checked)

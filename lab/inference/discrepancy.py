@@ -156,7 +156,7 @@ def _strongest(white: FloatArray, columns: FloatArray, largest: float) -> FloatA
 
 
 @dataclass(frozen=True)
-class _Process:
+class _SmoothChange:
     """One process: a law with the value `v` at node k and none at the others, its nodes, and the unit in which it
     varies by 1."""
 
@@ -167,7 +167,7 @@ class _Process:
     correlated: float = _NODES_CORRELATED
 
 
-def _columns(model: MeasurementModel, base: FloatArray, processes: Iterator[_Process]) -> Iterator[FloatArray]:
+def _columns(model: MeasurementModel, base: FloatArray, processes: Iterator[_SmoothChange]) -> Iterator[FloatArray]:
     for process in processes:
         own = []
         for k in range(process.first, process.nodes):
@@ -182,7 +182,7 @@ def _columns(model: MeasurementModel, base: FloatArray, processes: Iterator[_Pro
 
 def _curve(
     stage: Stage, along: Along, of: Of, at: Sequence[float] | FloatArray, unit: float = 1.0, first: int = 0
-) -> _Process:
+) -> _SmoothChange:
     """Return the process of a curve of `EmpiricalLaw` with its points at `at`."""
     none = PLACES[stage, along, of][1]
     points = tuple(float(x) for x in at)
@@ -192,33 +192,33 @@ def _curve(
         table[k] = none + value
         return EmpiricalLaw(stage=stage, along=along, of=of, at=points, table=tuple(table), strength=1.0)
 
-    return _Process(law, len(points), unit, first)
+    return _SmoothChange(law, len(points), unit, first)
 
 
-def _directed(shape: str, at: Sequence[float]) -> _Process:
+def _directed(shape: str, at: Sequence[float]) -> _SmoothChange:
     def law(k: int, value: float) -> Effect:
         change = [0.0] * len(at)
         change[k] = value
         return TransferDiscrepancy(shape=shape, at=tuple(at), change=tuple(change), strength=1.0)  # type: ignore[arg-type]
 
-    return _Process(law, len(at), first=1)
+    return _SmoothChange(law, len(at), first=1)
 
 
-def _transfer(dataset: Dataset) -> Iterator[_Process]:
+def _transfer(dataset: Dataset) -> Iterator[_SmoothChange]:
     at = (np.linspace(0.0, 1.0, 8) / dataset.camera.pixel_pitch_um).tolist()
     yield _curve("image", "frequency", "mean", at, first=1)
     for shape in ("astigmatic", "diagonal", "chromatic"):
         yield _directed(shape, at)
 
 
-def _field(dataset: Dataset) -> Iterator[_Process]:
+def _field(dataset: Dataset) -> Iterator[_SmoothChange]:
     camera = dataset.camera
     corner_um = 0.5 * camera.pixel_pitch_um * float(np.hypot(camera.rows, camera.cols))
     yield _curve("image", "radius", "mean", np.linspace(0.0, corner_um, 5))
     yield _curve("image", "angle", "mean", np.linspace(0.0, 360.0, 9))
 
 
-def _spectral(dataset: Dataset) -> Iterator[_Process]:
+def _spectral(dataset: Dataset) -> Iterator[_SmoothChange]:
     stated = [c.wavelength_nm for c in dataset.recordings.captures("narrowband", dataset.side)]
     low, high = (min(stated), max(stated)) if stated else (400.0, 700.0)
     nodes = int(np.clip((high - low) / _SPECTRAL_STEP_NM, 4, _MOST_SPECTRAL)) + 1
@@ -230,7 +230,7 @@ def _levels_e(dataset: Dataset) -> FloatArray:
     return np.geomspace(0.01, 1.0, 7) * dataset.camera.full_well_e
 
 
-def _response(dataset: Dataset) -> Iterator[_Process]:
+def _response(dataset: Dataset) -> Iterator[_SmoothChange]:
     yield _curve("signal", "level", "mean", _levels_e(dataset).tolist())
     exposures = sorted({float(c.exposure_s) for c in dataset.recordings.captures("flat", dataset.side)})
     if len(exposures) > 1:
@@ -243,11 +243,11 @@ def _times_s(dataset: Dataset) -> FloatArray:
     return np.linspace(0.0, max(times[-1], 1.0), 7)
 
 
-def _source(dataset: Dataset) -> Iterator[_Process]:
+def _source(dataset: Dataset) -> Iterator[_SmoothChange]:
     yield _curve("light", "time", "mean", _times_s(dataset))
 
 
-def _offset(dataset: Dataset) -> Iterator[_Process]:
+def _offset(dataset: Dataset) -> Iterator[_SmoothChange]:
     camera = dataset.camera
     unit = camera.read_noise_e
     corner_um = 0.5 * camera.pixel_pitch_um * float(np.hypot(camera.rows, camera.cols))
@@ -257,11 +257,11 @@ def _offset(dataset: Dataset) -> Iterator[_Process]:
         yield _curve("signal", line, "mean", np.linspace(0.0, 1.0, 6), unit)
 
 
-def _shot(dataset: Dataset) -> Iterator[_Process]:
+def _shot(dataset: Dataset) -> Iterator[_SmoothChange]:
     yield _curve("charge", "level", "variance", _levels_e(dataset).tolist())
 
 
-_ON_STATES: dict[GroupDeclaration, Callable[[Dataset], Iterator[_Process]]] = {
+_ON_STATES: dict[GroupDeclaration, Callable[[Dataset], Iterator[_SmoothChange]]] = {
     TRANSFER: _transfer, FIELD: _field, SPECTRAL: _spectral, RESPONSE: _response, SOURCE: _source, OFFSET: _offset,
     SHOT: _shot,
 }  # fmt: skip

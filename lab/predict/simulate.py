@@ -27,7 +27,7 @@ from lab.formats.raw_file import (
 )
 from lab.formats.result_file import installed_versions
 from lab.formats.scene_file import light, scene
-from lab.shown import Shown
+from lab.shown import Displayable
 from sim import frame as sim_frame
 from sim.camera import CameraModel, Geometry, Lens
 from sim.effects.distortion import Distortion
@@ -105,7 +105,7 @@ class SimulationRecord(Frozen):
 
 
 @dataclass(frozen=True, eq=False, repr=False)  # an IPython prompt prefers a dataclass's own text
-class Simulation(Shown):
+class Simulation(Displayable):
     """A simulated frame (rows, cols) in DN, its camera, the spectral radiance of the scene's white, and the record."""
 
     frame: Frame

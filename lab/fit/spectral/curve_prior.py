@@ -101,7 +101,7 @@ class CurvePrior:
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior:
+class CurvePosterior:
     """Posterior `mean` (m,) and `covariance` (m, m) of a curve.
 
     `gain` (m, n): Jacobian of the mean by the signals; `precision` (n, n): inverse covariance of the signals under the
@@ -135,7 +135,7 @@ def likeliest_prior(
 
 def posterior_under_prior(
     wave: FloatArray, operator: FloatArray, value: FloatArray, std: FloatArray, prior: CurvePrior
-) -> Posterior:
+) -> CurvePosterior:
     """Return the posterior of S with value = operator S + noise under `prior`, straight lines free.
 
     `operator` (n, m), `value`, `std` (n,) of the signals.
@@ -153,7 +153,7 @@ def posterior_under_prior(
     share = singular / (1.0 + singular**2)
     gain = (root @ right[: singular.size].T * share) @ (left[:, : singular.size] / std[:, None]).T
     unknown = left / std[:, None] / np.sqrt(1.0 + np.append(singular, np.zeros(left.shape[1] - singular.size)) ** 2)
-    return Posterior(gain @ value, half @ half.T, gain, unknown @ unknown.T)
+    return CurvePosterior(gain @ value, half @ half.T, gain, unknown @ unknown.T)
 
 
 def least_misfit(covariance: FloatArray, line: FloatArray, value: FloatArray, std: FloatArray) -> tuple[float, float]:

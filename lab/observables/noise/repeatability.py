@@ -112,7 +112,7 @@ def weighted_median(value: FloatArray, weight: FloatArray) -> float:
 
 
 @dataclass(frozen=True)
-class Scatter:
+class RepeatScatter:
     """The scatter of repeats: variance beyond the noise of pixels, sum of squares, and degrees of freedom."""
 
     excess: float
@@ -120,7 +120,7 @@ class Scatter:
     freedom: float
 
 
-def scatter_beyond_noise(repeats: Sequence[RepeatedMeans]) -> Scatter:
+def scatter_beyond_noise(repeats: Sequence[RepeatedMeans]) -> RepeatScatter:
     """Return the scatter of repeats about a drift with time that all settings have in common.
 
     The excess is 0 where the noise explains the scatter: chi2 of a probability above `EXPLAINED`. Settings are weighted
@@ -135,11 +135,11 @@ def scatter_beyond_noise(repeats: Sequence[RepeatedMeans]) -> Scatter:
         free -= 1.0
     square = np.array([float(np.sum(np.square(r.away - trend * r.elapsed_s))) for r in repeats])
     if free < 1 or special.chdtrc(free, float(weight @ square)) > EXPLAINED:
-        return Scatter(0.0, float(square.sum()), free)
+        return RepeatScatter(0.0, float(square.sum()), free)
     own = free / freedom.sum() * freedom  # degrees of freedom less the trend's
     noise = np.array([r.noise for r in repeats])
     excess = float(weight @ (square - own * noise)) / float(weight @ own)
-    return Scatter(max(excess, 0.0), float(square.sum()), free)
+    return RepeatScatter(max(excess, 0.0), float(square.sum()), free)
 
 
 def level_repeatability(repeats: Sequence[RepeatedMeans]) -> float:
