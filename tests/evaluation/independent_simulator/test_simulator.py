@@ -181,6 +181,30 @@ def test_a_pattern_keeps_its_light() -> None:
     assert lit == pytest.approx(16 * 4.0**2, rel=0.01)  # the turned square's rim on the fine grid
 
 
+@pytest.mark.parametrize("turn_deg", [0.0, 0.07, 0.6])
+@pytest.mark.parametrize("cell_px", [4.0, 4.1])
+def test_a_pattern_of_stripes_is_its_fourier_series(cell_px: float, turn_deg: float) -> None:
+    """Stripes are a square wave: each odd harmonic n, of amplitude 2 / (pi n), passes the lens by its own transfer.
+
+    Cells of a whole number of pixels that stand square alias alike all over the frame. The blur (0.37 px) leaves
+    nothing above 2 cy/px, the highest frequency of the grid."""
+    camera = mono(ChargeDiffusionLaw(0.37 * mono().pitch_um, 0, 1), rows=48, cols=256)
+    stripes = np.tile(np.arange(80.0) % 2, (60, 1))
+    seen = pattern(camera, stripes, LAMP, 0.0, cell_px, turn_deg)["Y"] / camera.rate(LAMP, "Y")
+    turn = np.deg2rad(turn_deg)
+    down, right = (at - 0.5 * (n - 1) for at, n in zip(np.indices(seen.shape), seen.shape, strict=True))
+    phase = np.pi * (down * np.sin(turn) + right * np.cos(turn)) / cell_px
+    harmonic = np.arange(1, 4.0 * cell_px, 2.0)
+    frequency = harmonic / (2.0 * cell_px)
+    amplitude = 2.0 / (np.pi * harmonic) * camera.lens.otf(frequency, turn, LAMP, "Y")
+    series = 0.5 - np.tensordot(amplitude, np.sin(np.multiply.outer(harmonic, phase)), 1)
+    middle = (slice(12, -12), slice(80, -80))  # the lens's tails carry the continued border less than 1e-4 so far
+    # 16 samples a pixel: harmonics at 16 m -+ f cy/px, weaker by f / 16 m and passed by f / 16 m, alias to f; the sum
+    # of 1 / m^2 is pi^2 / 6
+    aliased = float(np.sum(np.abs(amplitude) * 2.0 * np.square(frequency / 16.0))) * np.pi**2 / 6.0
+    assert np.abs(seen - series)[middle].max() < aliased + 1e-4
+
+
 def test_glare_moves_light_and_makes_none() -> None:
     camera = mono(VeilingGlareLaw(3.0))
     image = np.random.default_rng(1).random((96, 128))
