@@ -111,12 +111,12 @@ class _Intrinsics:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def _intrinsics(content: CameraFile, pinhole_counts: Sequence[int], *, fisheye: bool = True) -> _Intrinsics:
+def _intrinsics(content: CameraFile, pinhole_counts: Sequence[int]) -> _Intrinsics:
     """Return a camera's intrinsics in the laws of a format.
 
     `pinhole_counts`: the numbers of coefficients that its pinholes have, ascending; the first that is enough is taken,
-    padded with zeros. Without any, the last is fitted. `fisheye`: it has the equidistant projection, to which a splined
-    one is fitted. Raises InputError where a fisheye has no place, or there is no geometry and no focal length.
+    padded with zeros. Without any, the last is fitted. A splined projection is fitted by the equidistant one. Raises
+    InputError where there is no geometry and no focal length.
     """
     camera = content.camera
     if camera.geometry is None and camera.lens.focal_length_mm is None:
@@ -133,11 +133,6 @@ def _intrinsics(content: CameraFile, pinhole_counts: Sequence[int], *, fisheye: 
             "geometry: not set; a pinhole of lens.focal_length_mm with its centre in the frame's middle is written",
             *remarks,
         )
-    if projection.kind != "pinhole" and not fisheye:
-        raise InputError(
-            f"{content.name}: geometry.projection is {projection.kind}, which this format has no law for; export as "
-            "opencv, ros, kalibr or colmap"
-        )
     given = tuple(float(value) for value in geometry.distortion)
     used = max((place for place, value in enumerate(given, start=1) if value), default=0)
     if projection.kind == "pinhole":
@@ -152,31 +147,43 @@ def _intrinsics(content: CameraFile, pinhole_counts: Sequence[int], *, fisheye: 
     else:
         fitted, left_px = _fitted(camera, geometry, Projection("equidistant"), 4)
         lost = "the splined stereographic projection"
-    if left_px > TOLD_PX:
-        size = f"{left_px:.2f}" if left_px >= 0.01 else f"{left_px:.1e}"
-        remarks = (f"distortion: no place for {lost}; the fitted law leaves {size} px at most", *remarks)
+    remarks = (*_departure(lost, left_px), *remarks)
     kind: ProjectionKind = "pinhole" if projection.kind == "pinhole" else "equidistant"
     return _Intrinsics(kind, place, fitted, remarks)
+
+
+def _departure(lost: str, left_px: float) -> tuple[str, ...]:
+    """Return the line on a law that a format doesn't have, with the greatest distance that is left (px)."""
+    size = f"{left_px:.2f}" if left_px >= 0.01 else f"{left_px:.1e}"
+    told = left_px > TOLD_PX
+    return (f"distortion: no place for {lost}; the fitted law leaves {size} px at most",) if told else ()
+
+
+def _frame(camera: CameraModel, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
+    """Return places over the frame that the camera sees, px (n, 2), and their rays (n, 3)."""
+    own = Projection.of(geometry)
+    row, col = np.meshgrid(
+        np.linspace(0.0, camera.rows - 1.0, NODES), np.linspace(0.0, camera.cols - 1.0, NODES), indexing="ij"
+    )
+    image = np.column_stack([col.ravel(), row.ravel()])
+    rays = own.unproject(image, own.intrinsics(geometry.camera_matrix, geometry.distortion))
+    seen = np.all(np.isfinite(rays), axis=1)
+    return image[seen], rays[seen]
 
 
 def _fitted(camera: CameraModel, geometry: Geometry, to: Projection, count: int) -> tuple[tuple[float, ...], float]:
     """Return the first `count` coefficients of a law, fitted to a geometry over the frame by least squares in px, and
     the greatest distance that is left (px). The law is linear in them, up to the denominator's, which aren't fitted."""
-    own = Projection.of(geometry)
-    intrinsics = own.intrinsics(geometry.camera_matrix, geometry.distortion)
-    row, col = np.meshgrid(
-        np.linspace(0.0, camera.rows - 1.0, NODES), np.linspace(0.0, camera.cols - 1.0, NODES), indexing="ij"
-    )
-    image = np.column_stack([col.ravel(), row.ravel()])
-    rays = own.unproject(image, intrinsics)
-    seen = np.all(np.isfinite(rays), axis=1)
-    seen[seen] &= to.sees(rays[seen])
+    image, rays = _frame(camera, geometry)
+    seen = to.sees(rays)
+    image, rays = image[seen], rays[seen]
+    intrinsics = Projection.of(geometry).intrinsics(geometry.camera_matrix)
     plain = np.zeros(COUNT)
     plain[:4] = intrinsics[:4]
-    at, _, by_camera = to.project_with_jacobian(rays[seen], plain)
+    at, _, by_camera = to.project_with_jacobian(rays, plain)
     places = [to.names.index(name) for name in to.coefficients[:count]]
     design = by_camera[:, :, places].reshape(-1, count)
-    miss = (image[seen] - at).ravel()
+    miss = (image - at).ravel()
     scale = np.linalg.norm(design, axis=0)
     solved, *_ = np.linalg.lstsq(design / scale, miss, rcond=None)
     left = (miss - design @ (solved / scale)).reshape(-1, 2)
@@ -351,31 +358,82 @@ _MRCAL_MODELS = {0: "LENSMODEL_PINHOLE", 4: "LENSMODEL_OPENCV4", 5: "LENSMODEL_O
 
 def write_mrcal(file: Path, content: CameraFile, pair: Pair | None = None) -> tuple[str, ...]:
     """Write mrcal's .cameramodel, of a pair NAME-left and NAME-right with the left camera as the reference. Returns
-    what it has no place for; raises InputError, of a fisheye, too.
+    what it has no place for; raises InputError. A fisheye becomes its splined stereographic projection.
     """
     import cv2
 
     remarks: tuple[str, ...] = ()
     for side, one in _sides(content, pair).items():
-        found = _intrinsics(one, (0, 4, 5, 8), fisheye=False)
         pose = np.zeros(6)
         if pair is not None and side == "right":
             pose[:3] = cv2.Rodrigues(pair.rotation)[0].ravel()
             pose[3:] = pair.translation_mm * METRE_PER_MM
+        if one.camera.geometry is not None and one.camera.geometry.projection != "pinhole":
+            model, numbers, told = _splined(one, one.camera.geometry)
+        else:
+            found = _intrinsics(one, (0, 4, 5, 8))
+            model, told = _MRCAL_MODELS[len(found.coefficients)], found.remarks
+            numbers = (*found.focal_centre_px, *found.coefficients)
         text = (
             f"# {' '.join(one.name.split())}, by calibench\n"
             "{\n"
-            f"    'lensmodel':  '{_MRCAL_MODELS[len(found.coefficients)]}',\n\n"
+            f"    'lensmodel':  '{model}',\n\n"
             f"    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....\n"
-            f"    'intrinsics': {_listed((*found.focal_centre_px, *found.coefficients))},\n\n"
+            f"    'intrinsics': {_listed(numbers)},\n\n"
             f"    # the transformation from the reference to the camera: Rodrigues' vector, and m\n"
             f"    'extrinsics': {_listed(pose)},\n\n"
             f"    'imagersize': [ {one.camera.cols}, {one.camera.rows}, ]\n"
             "}\n"
         )
         _write(_beside(file, side), text)
-        remarks += _told(side, found.remarks)
+        remarks += _told(side, told)
     return remarks
+
+
+#: Control points across the frame's width of the surfaces that mrcal splines, samples an interval when they are fitted,
+#: and intervals of a cubic surface that its outermost control points don't span (mrcal.c).
+_ACROSS, _SAMPLES, _MARGIN = 40, 6, 2
+
+
+def _splined(content: CameraFile, geometry: Geometry) -> tuple[str, tuple[float, ...], tuple[str, ...]]:
+    """Return mrcal's LENSMODEL_SPLINED_STEREOGRAPHIC of a fisheye: its name, its intrinsics, and what is left.
+
+    u = 2 tan(theta / 2) in the direction of the ray; q = f (u + d(u)) + c, with d two surfaces of cubic B-splines over
+    a grid of control points, the middle of which is u = 0 (mrcal's documentation, `LENSMODEL_SPLINED_STEREOGRAPHIC`).
+    """
+    from scipy.interpolate import BSpline  # here: the library takes a while to load
+
+    own, stereographic = Projection.of(geometry), Projection("splined_stereographic", 90.0)
+    intrinsics = own.intrinsics(geometry.camera_matrix, geometry.distortion)
+    focal, centre = intrinsics[:2], intrinsics[2:4]
+    image, rays = _frame(content.camera, geometry)
+    u = np.column_stack(stereographic.plane(rays))
+    reach = np.abs(u).max(axis=0)
+    # a whole number of degrees, and one more, so that the frame's edge is inside
+    degrees = int(np.ceil(np.rad2deg(4.0 * np.arctan(reach[0] / 2.0)))) + 1
+    per_u = (_ACROSS - 1 - _MARGIN) / (4.0 * np.tan(np.deg2rad(degrees) / 4.0))
+    counts = (_ACROSS, int(np.ceil(2.0 * reach[1] * per_u)) + 2 + _MARGIN)
+
+    def basis(at_u: FloatArray, count: int) -> FloatArray:
+        """B-splines (n, count) at places of one axis; control point k is at k, the middle of all at u = 0."""
+        place = at_u * per_u + 0.5 * (count - 1)
+        return np.asarray(BSpline.design_matrix(place, np.arange(-2.0, count + 2.0), 3).toarray())
+
+    axes = [
+        np.linspace(-half, half, _SAMPLES * count)
+        for count in counts
+        for half in [(0.5 * (count - 1) - 1.0 - 1e-9) / per_u]
+    ]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)  # rows: y
+    shift = (own.project(stereographic.rays(*grid.T), intrinsics) - centre) / focal - grid
+    across, down = (np.linalg.pinv(basis(axis, count)) for axis, count in zip(axes, counts, strict=True))
+    surfaces = shift.reshape(len(axes[1]), len(axes[0]), 2)
+    control = np.einsum("ia,abk,jb->ijk", down, surfaces, across, optimize=True)
+    bent = np.einsum("ni,ijk,nj->nk", basis(u[:, 1], counts[1]), control, basis(u[:, 0], counts[0]), optimize=True)
+    left_px = float(np.hypot(*((u + bent) * focal + centre - image).T).max())
+    model = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={counts[0]}_Ny={counts[1]}_fov_x_deg={degrees}"
+    numbers = (*intrinsics[:4].tolist(), *control.ravel().tolist())
+    return model, numbers, (*_departure(f"the {own.kind} projection", left_px), *_left_out(content))
 
 
 def _listed(values: Sequence[float] | FloatArray) -> str:

@@ -18,7 +18,16 @@ import yaml
 from lab import cli
 from lab.errors import InputError
 from lab.formats.camera_file import CameraFile, default_camera, write_camera
-from lab.formats.geometry_files import Pair, paired, write_colmap, write_kalibr, write_mrcal, write_opencv, write_ros
+from lab.formats.geometry_files import (
+    TOLD_PX,
+    Pair,
+    paired,
+    write_colmap,
+    write_kalibr,
+    write_mrcal,
+    write_opencv,
+    write_ros,
+)
 from lab.formats.result_file import write_result
 from lab.formats.results.fit import FitResult, Rectification, StereoFit
 from sim.camera import Geometry
@@ -41,6 +50,12 @@ SPLINED = Geometry(
     distortion=(-0.01, -0.02, 1e-4, -1e-4, -0.02, -0.03, -0.03, -0.02),
     projection="splined_stereographic",
     spline_angle_deg=60.0,
+)
+#: A fisheye whose frame is 186 deg wide.
+WIDE = Geometry(
+    camera_matrix=((380.0, 0.0, 641.3), (0.0, 380.0, 470.2), (0.0, 0.0, 1.0)),
+    distortion=(0.02, -0.002, 0.0, 0.0),
+    projection="equidistant",
 )
 #: Points before the camera (m), out to 33 deg from its axis.
 POINTS = np.array([[x, y, 1.5] for x in np.linspace(-0.8, 0.8, 9) for y in np.linspace(-0.6, 0.6, 7)])
@@ -316,6 +331,11 @@ def test_a_cameramodel_is_a_dict_that_projects_as_the_camera(tmp_path: Path, nam
     np.testing.assert_allclose(at, projected(GEOMETRIES[name]), rtol=0, atol=CLOSE_PX)
 
 
+def splines_departure_px(remarks: tuple[str, ...]) -> float:
+    """What the warning says; below the limit of what is told there is none."""
+    return float(re.findall(r"leaves (\S+) px", remarks[0])[0]) if remarks else TOLD_PX
+
+
 class LensModel(ctypes.Structure):
     """mrcal_lensmodel_t of mrcal 2.2."""
 
@@ -339,9 +359,11 @@ def test_mrcal_itself_agrees(tmp_path: Path) -> None:
     except OSError:
         pytest.skip("libmrcal 2.2 isn't installed (the distribution's libmrcal2); its text is compared above")
     mrcal.mrcal_read_cameramodel_file.restype = ctypes.POINTER(CameraModelFile)
-    for left, right in (("ideal", "k1 k2 p1 p2"), ("k3", "k6")):
-        assert write_mrcal(tmp_path / "p.cameramodel", *pair(GEOMETRIES[left], GEOMETRIES[right])) == ()
-        for side, name in (("left", left), ("right", right)):
+    for names in (("ideal", "k1 k2 p1 p2"), ("k3", "k6"), ("fisheye", "wide")):
+        left, right = ((GEOMETRIES | {"wide": WIDE})[name] for name in names)
+        remarks = write_mrcal(tmp_path / "p.cameramodel", *pair(left, right))
+        assert len(remarks) == ("wide" in names)
+        for side, geometry in (("left", left), ("right", right)):
             model = mrcal.mrcal_read_cameramodel_file(str(tmp_path / f"p-{side}.cameramodel").encode())
             assert model and tuple(model.contents.size) == (1280, 960)
             pose = np.array(model.contents.pose)
@@ -354,15 +376,38 @@ def test_mrcal_itself_agrees(tmp_path: Path) -> None:
                 ctypes.byref(model.contents.lens), ctypes.byref(model.contents.intrinsics),
             )  # fmt: skip
             assert done
-            expected = projected(GEOMETRIES[name], POINTS @ turned.T + moved)
-            np.testing.assert_allclose(found, expected, rtol=0, atol=CLOSE_PX)
+            expected = projected(geometry, POINTS @ turned.T + moved)
+            left_px = CLOSE_PX if geometry.projection == "pinhole" else 1.5 * splines_departure_px(remarks)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=left_px)
 
 
-def test_mrcal_has_no_fisheye(tmp_path: Path) -> None:
-    for geometry in (GEOMETRIES["fisheye"], SPLINED):
-        with pytest.raises(InputError, match=f"geometry.projection is {geometry.projection}"):
-            write_mrcal(tmp_path / "c.cameramodel", camera(geometry))
-    assert not list(tmp_path.iterdir())
+@pytest.mark.parametrize("name", ["fisheye", "wide fisheye", "splined"])
+def test_a_fisheye_becomes_mrcals_splined_projection(tmp_path: Path, name: str) -> None:
+    """By mrcal's formulas: the four weights of a uniform cubic B-spline in each direction."""
+    geometry = {"fisheye": GEOMETRIES["fisheye"], "wide fisheye": WIDE, "splined": SPLINED}[name]
+    remarks = write_mrcal(tmp_path / "c.cameramodel", camera(geometry))
+    left_px = splines_departure_px(remarks)
+    assert left_px < 0.01 and (name == "fisheye") == (not remarks)
+    found = ast.literal_eval((tmp_path / "c.cameramodel").read_text())
+    nx, ny, degrees = map(int, re.findall(r"=(\d+)", found["lensmodel"].partition("order=3")[2]))
+    values = np.array(found["intrinsics"][4:]).reshape(ny, nx, 2)
+    fx, fy, cx, cy = found["intrinsics"][:4]
+    per_u = (nx - 3) / (4.0 * np.tan(np.deg2rad(degrees) / 4.0))
+
+    def weights(t: float) -> FloatArray:
+        return np.array([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]) / 6.0
+
+    nearer = POINTS * (1.0, 1.0, 0.2 if name == "wide fisheye" else 1.0)  # out to 73 deg
+    points, at = nearer[np.all(np.abs(projected(geometry, nearer) - (640, 480)) < (639, 479), axis=1)], []
+    assert len(points) > 20
+    for x, y, z in points:
+        scale = 2.0 / (np.sqrt(x * x + y * y + z * z) + z)
+        px, py = x * scale * per_u + 0.5 * (nx - 1), y * scale * per_u + 0.5 * (ny - 1)
+        column, row = int(px), int(py)
+        part = values[row - 1 : row + 3, column - 1 : column + 3]
+        du, dv = np.einsum("i,ijk,j->k", weights(py - row), part, weights(px - column))
+        at.append(((x * scale + du) * fx + cx, (y * scale + dv) * fy + cy))
+    assert np.hypot(*(np.array(at) - projected(geometry, points)).T).max() < 1.5 * left_px
 
 
 # --- all of them ------------------------------------------------------------------------------------------------------
