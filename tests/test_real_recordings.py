@@ -82,6 +82,11 @@ def test_what_got_worse_is_told() -> None:
         "held-out chi2 over n: 1.2, was 1",
         "worst held-out chi2 over n (dark): 1.2, was 1",
     ]
+    assert worse(_result(after=1.0), _result(after=52.0)) == []  # a covariance that was too wide
+    assert worse(_result(after=1.0), _result(after=60.0)) == [
+        "held-out chi2 over n: 1.2, was 0.02",
+        "worst held-out chi2 over n (dark): 1.2, was 0.02",
+    ]
     # 1.5 and more than the 99.9 % quantile of chi2 of 50 numbers, 86.7, of which nothing tells
     assert "a remainder that isn't told: left dark" in worse(good, _result(after=90.0))
     assert worse(good, _result(cpu_s=40.0)) == ["CPU time: 40 s, was 20 s"]
