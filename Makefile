@@ -47,7 +47,7 @@ aravis:
 	scripts/install-aravis
 
 # Simulators of INDI's and Alpaca's cameras, Argyll's spotread, and the packages that only `make ci-extra` needs: makers' libraries with
-# emulated cameras, the driver of the browser, a database server. Tests that need them skip without them.
+# emulated cameras, the driver of the browser, a database server; COLMAP and mrcal, which read exports. Tests that need them skip without them.
 peers: $(STAMP)
 	scripts/install-peers $(BIN)/python
 

@@ -16,23 +16,29 @@ from lab.errors import InputError
 from lab.pipeline import session_recordings
 
 if TYPE_CHECKING:
+    from lab.formats.camera_file import CameraFile
     from lab.formats.cgats import CgatsSpectra
     from lab.formats.importers.single_picture import ImportOptions
 
 #: `import --from` these, and `export --as` these; the last of a camera file.
 SPECTRA, LENSFUN, TILED = "spectra", "lensfun", "tiled"
-OF_A_CAMERA = (LENSFUN, "rawtoaces", "dcp", "icc", "pyxel")
+#: `export --as` these takes a stereo pair, too.
+OF_A_PAIR = ("opencv", "ros", "kalibr", "colmap", "mrcal")
+OF_A_CAMERA = (LENSFUN, "rawtoaces", "dcp", "icc", "pyxel", "isetcam", *OF_A_PAIR)
 
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What is stated of an export for Pyxel: exposure and light (`photons` a pixel in it, None: to half of the full
-    well), and the channel whose quantum efficiency it gets."""
+    """What is stated of an export: for Pyxel exposure and light (`photons` a pixel in it, None: to half of the full
+    well), and the channel whose quantum efficiency it gets; of a pair the right camera's file, and the fit (JSON) that
+    has its pose."""
 
     exposure_s: float = 0.01
     photons: float | None = None
     wavelength_nm: float = 550.0
     channel: str = ""
+    right: Path | None = None
+    fit: Path | None = None
 
 
 def import_spectra(path: Path, to: Path) -> None:
@@ -115,11 +121,14 @@ def export_camera(kind: str, source: str, to: Path, options: ExportOptions) -> N
     """A camera file as one of `OF_A_CAMERA`."""
     from lab.formats.camera_file import read_camera
     from lab.formats.colour_profile import write_dcp, write_icc, write_rawtoaces
+    from lab.formats.isetcam_sensor import write_isetcam
     from lab.formats.lensfun import write_lensfun
     from lab.formats.pyxel_file import write_pyxel
 
     if not source.endswith(".toml"):
         raise InputError(f"{source}: --as {kind} is of a camera file; `calibench fit --write-cameras` writes one")
+    if (options.right is not None or options.fit is not None) and kind not in OF_A_PAIR:
+        raise InputError(f"--as {kind} is of one camera; leave out --right and --fit, or take {', '.join(OF_A_PAIR)}")
     content = read_camera(Path(source))
     if kind == "pyxel":
         at = content.camera.quantum_efficiency
@@ -135,11 +144,50 @@ def export_camera(kind: str, source: str, to: Path, options: ExportOptions) -> N
             wavelength_nm=options.wavelength_nm,
             channel=options.channel,
         )
+    elif kind in OF_A_PAIR:
+        remarks = _write_geometry(kind, to, content, options)
     else:
-        writer = {LENSFUN: write_lensfun, "rawtoaces": write_rawtoaces, "dcp": write_dcp, "icc": write_icc}[kind]
+        writer = {
+            LENSFUN: write_lensfun,
+            "rawtoaces": write_rawtoaces,
+            "dcp": write_dcp,
+            "icc": write_icc,
+            "isetcam": write_isetcam,
+        }[kind]
         remarks = writer(to, content)
     warn(tuple(f"{to}: {remark}" for remark in remarks))
     out.print(escape(str(to)))
+
+
+def _write_geometry(kind: str, to: Path, content: CameraFile, options: ExportOptions) -> tuple[str, ...]:
+    """The geometry of a camera, or of a pair, as one of `OF_A_PAIR`; what it has no place for."""
+    from lab.formats.camera_file import read_camera
+    from lab.formats.geometry_files import (
+        paired,
+        write_colmap,
+        write_kalibr,
+        write_mrcal,
+        write_opencv,
+        write_ros,
+    )
+    from lab.formats.result_file import read_result
+    from lab.formats.results.fit import FitResult
+
+    writer = {
+        "opencv": write_opencv,
+        "ros": write_ros,
+        "kalibr": write_kalibr,
+        "colmap": write_colmap,
+        "mrcal": write_mrcal,
+    }[kind]
+    if options.right is None and options.fit is None:
+        return writer(to, content)
+    if options.right is None or options.fit is None:
+        raise InputError("a pair needs both --right (the right camera's file) and --fit (what `fit --json` wrote)")
+    stereo = read_result(FitResult, options.fit).stereo
+    if stereo is None:
+        raise InputError(f"{options.fit}: has no pose of a stereo pair; fit both cameras' views of a board")
+    return writer(to, *paired(content, read_camera(options.right), stereo))
 
 
 def export_tiled(session: str, to: str, data: Path | None) -> None:

@@ -200,8 +200,8 @@ def export(
         str,
         typer.Argument(
             metavar="SOURCE",
-            help="a stored session's id; spectra: a CSV, or a recording set's folder, too; lensfun, rawtoaces, dcp, "
-            "icc and pyxel: a camera file",
+            help="a stored session's id; spectra: a CSV, or a recording set's folder, too; all others but tiled: a "
+            "camera file",
         ),
     ],
     to: Annotated[
@@ -217,7 +217,8 @@ def export(
         typer.Option(
             "--as",
             metavar="KIND",
-            help="recording-set, tiled, spectra (.sp or .ti3), lensfun, rawtoaces, dcp, icc or pyxel",
+            help="recording-set, tiled, spectra (.sp or .ti3), lensfun, rawtoaces, dcp, icc, pyxel, isetcam, opencv, "
+            "ros, kalibr, colmap or mrcal",
         ),
     ] = "recording-set",
     quantity: Annotated[
@@ -232,6 +233,13 @@ def export(
     ] = None,
     wavelength_nm: Annotated[float, typer.Option(help="pyxel: wavelength of the light")] = 550.0,
     channel: Annotated[str, typer.Option(metavar="R|G|B", help="pyxel: whose efficiency (without: green's)")] = "",
+    right: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="opencv, ros, kalibr, colmap, mrcal: of a pair, the right camera's file"),
+    ] = None,
+    fit: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="with --right: the JSON of the fit that has the pair's pose")
+    ] = None,
     data: StoreFolder = None,
 ) -> None:
     """Write a stored session as a recording set; spectra and cameras in the formats of other programs.
@@ -249,7 +257,7 @@ def export(
         export_tiled(source, to, data)
         return
     if kind in OF_A_CAMERA:
-        export_camera(kind, source, Path(to), ExportOptions(exposure_s, photons, wavelength_nm, channel))
+        export_camera(kind, source, Path(to), ExportOptions(exposure_s, photons, wavelength_nm, channel, right, fit))
         return
     if kind != "recording-set":
         raise InputError(f"--as {kind}: no such format; choose {', '.join((SPECTRA, TILED, *OF_A_CAMERA))}")

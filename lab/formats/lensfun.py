@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from lab.errors import InputError, one_line
 from lab.formats.camera_file import CameraFile
 from lab.formats.cgats import COMMA_NUMBER
+from lab.formats.geometry_files import geometry_of
 from lab.formats.raw_file import replacing
 from sim.camera import CameraModel, Geometry
 from sim.effects.base import Effect
@@ -131,19 +132,9 @@ def _focal_px(camera: CameraModel) -> float:
     return camera.lens.known_focal_length_mm * 1e3 / camera.pixel_pitch_um
 
 
-def _geometry(camera: CameraModel) -> Geometry:
-    """Return the camera's geometry, or the pinhole that its focal length and pitch give."""
-    if camera.geometry is not None:
-        return camera.geometry
-    f = _focal_px(camera)
-    return Geometry(
-        camera_matrix=((f, 0.0, 0.5 * (camera.cols - 1)), (0.0, f, 0.5 * (camera.rows - 1)), (0.0, 0.0, 1.0))
-    )
-
-
 def _centre(camera: CameraModel) -> tuple[float, float]:
     """Return the optical centre from the frame's middle (x, y), in lensfun's unit."""
-    matrix = _geometry(camera).camera_matrix
+    matrix = geometry_of(camera).camera_matrix
     x, y = matrix[0][2] - 0.5 * (camera.cols - 1), matrix[1][2] - 0.5 * (camera.rows - 1)
     half = _half_short_px(camera)
     return x / half, y / half
@@ -159,7 +150,7 @@ def _grid(camera: CameraModel) -> tuple[FloatArray, FloatArray]:
 
 def _poly5(camera: CameraModel, effects: Sequence[Effect]) -> tuple[float, float, tuple[str, ...]]:
     """k1, k2 of poly5, fitted to the camera's own distortion over the frame; exact for k1 and k2 of OpenCV's alone."""
-    geometry, half = _geometry(camera), _half_short_px(camera)
+    geometry, half = geometry_of(camera), _half_short_px(camera)
     matrix = geometry.camera_matrix
     col, row = _grid(camera)
     to_col, to_row = (np.asarray(one, float) for one in distort(col, row, geometry))
@@ -638,7 +629,7 @@ def with_lens(content: CameraFile, lens: LensfunLens) -> tuple[CameraFile, tuple
 
 def _centred(camera: CameraModel, centre: tuple[float, float]) -> CameraModel:
     """Return the camera with the optical axis at this place, from the frame's middle in half of its shorter side."""
-    geometry, half_px = _geometry(camera), _half_short_px(camera)
+    geometry, half_px = geometry_of(camera), _half_short_px(camera)
     (fx, skew, _), (shear, fy, _), last = geometry.camera_matrix
     cx, cy = 0.5 * (camera.cols - 1) + centre[0] * half_px, 0.5 * (camera.rows - 1) + centre[1] * half_px
     moved = geometry.model_copy(update={"camera_matrix": ((fx, skew, cx), (shear, fy, cy), last)})
@@ -665,7 +656,7 @@ def _brown(camera: CameraModel, lens: LensfunLens) -> tuple[Geometry, float]:
     focal = undistorted * scale
     k = found[1:] / scale * (undistorted / radius_px) ** np.array([2, 4, 6])
     p1, p2 = lens.decentring
-    before: NDArray[np.float64] = np.array(_geometry(camera).camera_matrix)
+    before: NDArray[np.float64] = np.array(geometry_of(camera).camera_matrix)
     matrix = ((focal, 0.0, float(before[0, 2])), (0.0, focal, float(before[1, 2])), (0.0, 0.0, 1.0))
     return Geometry(camera_matrix=matrix, distortion=(float(k[0]), float(k[1]), p1, p2, float(k[2]))), left_px
 
