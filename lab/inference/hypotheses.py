@@ -183,9 +183,9 @@ class SetPrior:
 
     def draw(self, rng: np.random.Generator) -> frozenset[str]:
         """Draw a set."""
-        k = int(rng.choice(len(self.number), p=np.array(self.number) / sum(self.number)))
         names = list(self.weight)
-        k = min(k, len(names))
+        number = np.array(self.number[: len(names) + 1])  # no set has more members
+        k = int(rng.choice(len(number), p=number / number.sum()))
         sets = list(combinations(names, k))
         if len(sets) > 20000:
             raise ValueError(f"{len(sets)} sets of {k} hypotheses: draw from 20000 at most, of a toy's hypotheses")

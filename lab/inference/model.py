@@ -266,6 +266,20 @@ class ScaleIntegral:
         others = [g for g in range(len(self.groups)) if g not in unlisted]
         return self._swept(self._swept(tau, others, unlisted), sorted(unlisted), unlisted)
 
+    def stratified(self, unlisted: frozenset[int], count: int) -> FloatArray:
+        """Return scales (count, G) of their posterior with these groups unlisted: a Latin hypercube of the quantiles of
+        each group's, the others at their mode."""
+        tau = self.mode(unlisted)
+        rng = np.random.default_rng(0)
+        found = np.tile(tau, (count, 1))
+        for g, group in enumerate(self.groups):
+            points = group.scales(g in unlisted)
+            values = self.profile(g, tau, points)
+            weight = np.exp(values - values.max())
+            share = (np.cumsum(weight) - 0.5 * weight) / weight.sum()
+            found[:, g] = np.interp((rng.permutation(count) + 0.5) / count, share, points)
+        return found
+
     def flipped(self, unlisted: frozenset[int]) -> float:
         """Log marginal likelihood with these groups unlisted, the scales of the others again at their mode."""
         return self.integrated(self.mode(unlisted), unlisted)

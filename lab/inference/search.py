@@ -64,6 +64,8 @@ EVALUATIONS = (8, 4)
 PAIRS, TRIPLES, EXTENSIONS = 120, 12, 10
 #: Standard deviations from its bound below which an amplitude's evidence is taken by quadrature.
 NEAR = 3.0
+#: Scales of the groups, drawn from their posterior, over which a closed form is averaged.
+SCALES_AVERAGED = 7
 #: Gain of log evidence up to which a size may be near 0, where shapes vanish.
 WEAK = 6.0
 #: Log evidence within which two alternatives of one hypothesis are both refitted, and the most that are.
@@ -558,6 +560,38 @@ class Search:
         table, r = white[:, :-1], white[:, -1]
         return table.T @ r, table.T @ table
 
+    def _averaged_over_scales(
+        self, origin: FittedSet, unlisted: frozenset[int], single: Mapping[int, tuple[float, FloatArray]]
+    ) -> dict[int, float]:
+        """Return the log evidence ratios of single signatures over a fitted set, with the groups' scales integrated:
+
+            p(y | A + k) / p(y | A) = mean over p(tau | y, A) of p(y | A + k, tau) / p(y | A, tau).
+
+        A hypothesis leaves less to the groups than the set without it, so that the ratio at that set's likeliest scales
+        is too small."""
+        groups = self.model.groups
+        if not groups:
+            return {i: ratio for i, (ratio, _) in single.items()}
+        gaussian = self.model.gaussian(origin.state, origin.likeliest.form)
+        residual = self.model.value - gaussian.mean
+        if len(origin.precision):
+            gaussian = with_columns(gaussian, origin.jacobian / np.sqrt(origin.precision))
+            residual = residual - origin.jacobian @ (origin.pull / origin.precision)
+        white = gaussian.whiten(np.column_stack([*(g.columns for g in groups), self._stack, residual]))
+        sizes = [g.columns.shape[1] for g in groups]
+        at = sum(sizes)
+        gram = white.T @ white
+        ratios: dict[int, list[float]] = {i: [] for i in single}
+        for tau in origin.likeliest.scales.stratified(unlisted, SCALES_AVERAGED):
+            amplitude = np.repeat(tau, sizes)
+            inner = np.eye(at) + amplitude[:, None] * gram[:at, :at] * amplitude
+            across = amplitude[:, None] * gram[:at, at:]
+            left = gram[at:, at:] - across.T @ np.linalg.solve(inner, across)
+            z, square = left[:-1, -1], left[:-1, :-1]
+            for i in single:
+                ratios[i].append(_set_integral(z, square, [self._signatures[i]])[0])
+        return {i: log_sum_exp(values) - float(np.log(len(values))) for i, values in ratios.items()}
+
     def _near_alternatives(self, origin: FittedSet, owner: str, chosen: int) -> list[tuple[int, FloatArray]]:
         """Return other alternatives of a hypothesis that are nearly as likely as the one chosen."""
         known = self._by_alternative[origin.members]
@@ -596,7 +630,8 @@ class Search:
             if s.owner not in origin.state:
                 single[i] = _set_integral(z, gram, [s])
                 owners.setdefault(s.owner, []).append(i)
-        gains = {o: log_sum_exp([single[i][0] for i in own]) - float(np.log(len(own))) for o, own in owners.items()}
+        ratio = self._averaged_over_scales(origin, unlisted, single)
+        gains = {o: log_sum_exp([ratio[i] for i in own]) - float(np.log(len(own))) for o, own in owners.items()}
         if not unlisted:
             for o, own in owners.items():
                 taken = {
@@ -610,7 +645,8 @@ class Search:
             self._by_alternative[origin.members] = single
             self.singles[origin.members] = gains
         best = {o: max(own, key=lambda i: single[i][0]) for o, own in owners.items()}
-        shared = {o: gains[o] - single[best[o]][0] for o in owners}  # of all alternatives over the best
+        # of all alternatives and scales over the best at the likeliest scales
+        shared = {o: gains[o] - single[best[o]][0] for o in owners}
         for o, gain in gains.items():
             self._estimate(origin, weight, {o}, gain, (best[o],), (single[best[o]][1],))
         pairs = self._pairs(origin, weight, z, gram, single, owners, shared)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.stats import multivariate_normal
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal, norm
+from scipy.stats import t as student_t
 
 from lab.inference.hypotheses import Coordinate, SetPrior
 from lab.inference.laplace import integrate, log_box
 from lab.inference.model import Group, ScaleIntegral
-from lab.inference.search import Search
+from lab.inference.search import ANY_UNLISTED, Search
 from sim.spectrum import FloatArray
 from tests.lab.inference.toys import Toy, linear, shaped
 
@@ -143,3 +145,46 @@ def test_the_prior_of_sets_sums_to_one() -> None:
     sets = [frozenset(s) for k in range(6) for s in combinations(families, k)]
     assert sum(np.exp(prior.log(s)) for s in sets) == pytest.approx(1.0, abs=1e-12)
     assert prior.weight["c"] == pytest.approx(2.0 * prior.weight["a"])
+
+
+def test_probabilities_of_an_effect_that_is_hardly_seen_are_those_of_quadrature() -> None:
+    """Draws with and without one effect beside an everyday discrepancy that looks like it: the log odds by sums over
+    400 points of the scale and 1,201 of the size. Seven points of the scale leave 0.1 at most, where the groups' scales
+    at their likeliest values would leave up to 1.8."""
+    points = 36
+    x = np.linspace(0.0, 1.0, points)
+    change, offset = 4.0 * (x - 0.5), 2.0 * np.ones((points, 1))
+    smooth = Group("smooth", 30.0 * np.exp(-0.5 * np.square((x[:, None] - np.linspace(0.0, 1.0, 6)) / 0.12)), 0.01)
+    hypotheses = {"line": linear("line", "slopes", 1.0, positive=False)}
+    prior = SetPrior({"line": "slopes"})
+    share = (np.arange(400) + 0.5) / 400
+    scales = {
+        False: smooth.everyday * norm.ppf(0.5 + 0.5 * share),
+        True: np.exp(np.log(3.0 * smooth.everyday) + share * np.log(smooth.largest / (3.0 * smooth.everyday))),
+    }
+    size = np.linspace(-12.0, 12.0, 1201)
+    log_size = student_t.logpdf(size, 3) + np.log(size[1] - size[0])
+    rng = np.random.default_rng(21)
+    away = []
+    for _ in range(16):
+        tau = smooth.everyday * abs(rng.standard_normal())
+        y = rng.standard_normal(points) + offset @ rng.standard_normal(1) + change * rng.normal(0.0, 0.25)
+        y = y + tau * smooth.columns @ rng.standard_normal(6)
+        log: dict[str, list[float]] = {"": [], "line": []}
+        for unlisted, values in scales.items():
+            own = np.log(ANY_UNLISTED if unlisted else 1.0 - ANY_UNLISTED) - np.log(len(values))
+            for value in values:
+                covariance = np.eye(points) + offset @ offset.T + value**2 * smooth.columns @ smooth.columns.T
+                lower = np.linalg.cholesky(covariance)
+                white, w = np.linalg.solve(lower, y), np.linalg.solve(lower, change)
+                base = own - float(np.log(np.diag(lower)).sum()) - 0.5 * float(white @ white)
+                log[""].append(base)
+                log["line"].append(base + float(logsumexp(size * (w @ white) - 0.5 * size**2 * (w @ w) + log_size)))
+        odds = logsumexp(log["line"]) - logsumexp(log[""])
+        exact = odds + prior.log(frozenset({"line"})) - prior.log(frozenset())
+        table = Search(Toy(y, {"line": lambda u: change * u[0]}, offset, (smooth,)), hypotheses, prior).run()
+        p = sum(row.probability for row in table.rows if "line" in row.members)
+        if 0.02 < p < 0.98:
+            away.append(float(np.log(p / (1.0 - p)) - exact))
+    assert len(away) > 8
+    assert np.abs(away).max() < 0.1
