@@ -589,7 +589,12 @@ class Search:
             left = gram[at:, at:] - across.T @ np.linalg.solve(inner, across)
             z, square = left[:-1, -1], left[:-1, :-1]
             for i in single:
-                ratios[i].append(_set_integral(z, square, [self._signatures[i]])[0])
+                signature = self._signatures[i]
+                if len(signature.columns) == 1:
+                    (k,), (c,) = signature.columns, signature.coordinates
+                    ratios[i].append(_amplitude_log_odds(float(z[k]), float(square[k, k]), c))
+                else:
+                    ratios[i].append(_set_integral(z, square, [signature])[0])
         return {i: log_sum_exp(values) - float(np.log(len(values))) for i, values in ratios.items()}
 
     def _near_alternatives(self, origin: FittedSet, owner: str, chosen: int) -> list[tuple[int, FloatArray]]:
