@@ -18,7 +18,7 @@ from evaluation.independent_simulator.laws import (
 )
 from lab.diagnose import diagnose
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.extra, pytest.mark.timeout(600)]  # a whole diagnosis each
 
 STRONG: tuple[Law, ...] = (
     TrefoilLaw(0.3, 0, 9),
