@@ -8,7 +8,7 @@ exchange."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -544,24 +544,28 @@ class Search:
             return np.zeros((len(self.model.value), 0))
         return np.concatenate([s.raw for s in self._signatures], axis=1)
 
-    def _linear(self, origin: FittedSet, unlisted: frozenset[int]) -> tuple[FloatArray, FloatArray]:
-        """Return z and R about a fitted set, its own parameters marginalised, with these groups unlisted."""
-        groups = self.model.groups
-        tau = origin.likeliest.scales.mode(unlisted)
-        gaussian = with_columns(
-            self.model.gaussian(origin.state, origin.likeliest.form),
-            scaled_columns(groups, tau, len(self.model.value)),
-        )
+    def _gram(self, origin: FittedSet) -> FloatArray:
+        """Return the Gram matrix of the groups' columns, the signatures and the residual about a fitted set, whitened
+        by all but the groups, the set's own parameters marginalised."""
+        gaussian = self.model.gaussian(origin.state, origin.likeliest.form)
         residual = self.model.value - gaussian.mean
         if len(origin.precision):
             gaussian = with_columns(gaussian, origin.jacobian / np.sqrt(origin.precision))
             residual = residual - origin.jacobian @ (origin.pull / origin.precision)
-        white = gaussian.whiten(np.column_stack([self._stack, residual]))
-        table, r = white[:, :-1], white[:, -1]
-        return table.T @ r, table.T @ table
+        white = gaussian.whiten(np.column_stack([*(g.columns for g in self.model.groups), self._stack, residual]))
+        return np.asarray(white.T @ white)
+
+    def _linear(self, gram: FloatArray, tau: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return z and R of the signatures with the groups at these scales (G,) marginalised, given `_gram`."""
+        amplitude = np.repeat(tau, [g.columns.shape[1] for g in self.model.groups])
+        at = len(amplitude)
+        inner = np.eye(at) + amplitude[:, None] * gram[:at, :at] * amplitude
+        across = amplitude[:, None] * gram[:at, at:]
+        left = gram[at:, at:] - across.T @ np.linalg.solve(inner, across)
+        return left[:-1, -1], left[:-1, :-1]
 
     def _averaged_over_scales(
-        self, origin: FittedSet, unlisted: frozenset[int], single: Mapping[int, tuple[float, FloatArray]]
+        self, origin: FittedSet, unlisted: frozenset[int], gram: FloatArray, single: Iterable[int]
     ) -> dict[int, float]:
         """Return the log evidence ratios of single signatures over a fitted set, with the groups' scales integrated:
 
@@ -569,32 +573,16 @@ class Search:
 
         A hypothesis leaves less to the groups than the set without it, so that the ratio at that set's likeliest scales
         is too small."""
-        groups = self.model.groups
-        if not groups:
-            return {i: ratio for i, (ratio, _) in single.items()}
-        gaussian = self.model.gaussian(origin.state, origin.likeliest.form)
-        residual = self.model.value - gaussian.mean
-        if len(origin.precision):
-            gaussian = with_columns(gaussian, origin.jacobian / np.sqrt(origin.precision))
-            residual = residual - origin.jacobian @ (origin.pull / origin.precision)
-        white = gaussian.whiten(np.column_stack([*(g.columns for g in groups), self._stack, residual]))
-        sizes = [g.columns.shape[1] for g in groups]
-        at = sum(sizes)
-        gram = white.T @ white
         ratios: dict[int, list[float]] = {i: [] for i in single}
         for tau in origin.likeliest.scales.stratified(unlisted, SCALES_AVERAGED):
-            amplitude = np.repeat(tau, sizes)
-            inner = np.eye(at) + amplitude[:, None] * gram[:at, :at] * amplitude
-            across = amplitude[:, None] * gram[:at, at:]
-            left = gram[at:, at:] - across.T @ np.linalg.solve(inner, across)
-            z, square = left[:-1, -1], left[:-1, :-1]
-            for i in single:
+            z, square = self._linear(gram, tau)
+            for i, values in ratios.items():
                 signature = self._signatures[i]
                 if len(signature.columns) == 1:
                     (k,), (c,) = signature.columns, signature.coordinates
-                    ratios[i].append(_amplitude_log_odds(float(z[k]), float(square[k, k]), c))
+                    values.append(_amplitude_log_odds(float(z[k]), float(square[k, k]), c))
                 else:
-                    ratios[i].append(_set_integral(z, square, [signature])[0])
+                    values.append(_set_integral(z, square, [signature])[0])
         return {i: log_sum_exp(values) - float(np.log(len(values))) for i, values in ratios.items()}
 
     def _near_alternatives(self, origin: FittedSet, owner: str, chosen: int) -> list[tuple[int, FloatArray]]:
@@ -618,15 +606,15 @@ class Search:
     def _linearise(self, origin: FittedSet) -> None:
         """Estimate all sets with one, two or three members more than a fitted one: with all groups everyday, and with
         the likeliest of them unlisted where that matters."""
-        weights = origin.by_groups
+        weights, gram = origin.by_groups, self._gram(origin)
         none: frozenset[int] = frozenset()
         best = max(weights, key=lambda u: weights[u])
         for unlisted in dict.fromkeys((none, best)):
             if weights[unlisted] > weights[best] - FAR_BELOW or unlisted == none:
-                self._linearise_with(origin, unlisted)
+                self._linearise_with(origin, unlisted, gram)
 
-    def _linearise_with(self, origin: FittedSet, unlisted: frozenset[int]) -> None:
-        z, gram = self._linear(origin, unlisted)
+    def _linearise_with(self, origin: FittedSet, unlisted: frozenset[int], whole: FloatArray) -> None:
+        z, gram = self._linear(whole, origin.likeliest.scales.mode(unlisted))
         weight = origin.by_groups[unlisted]
         signatures = self._signatures
         single: dict[int, tuple[float, FloatArray]] = {}
@@ -635,7 +623,7 @@ class Search:
             if s.owner not in origin.state:
                 single[i] = _set_integral(z, gram, [s])
                 owners.setdefault(s.owner, []).append(i)
-        ratio = self._averaged_over_scales(origin, unlisted, single)
+        ratio = self._averaged_over_scales(origin, unlisted, whole, single)
         gains = {o: log_sum_exp([ratio[i] for i in own]) - float(np.log(len(own))) for o, own in owners.items()}
         if not unlisted:
             for o, own in owners.items():
