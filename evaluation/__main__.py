@@ -273,15 +273,15 @@ def engines_command(
             metavar="SET...", help="folders, own:SEED, former:healthy:SEED or former:LAW:VARIANT:STRENGTH:SEED"
         ),
     ],
-    beside: Annotated[bool, typer.Option("--beside", help="also run today's diagnosis")] = False,
+    with_diagnosis: Annotated[bool, typer.Option("--with-diagnosis", help="also run today's diagnosis")] = False,
 ) -> None:
     """Print what the evidence engine reports of recordings.
 
-    Example: python -m evaluation engines own:1 --beside
+    Example: python -m evaluation engines own:1 --with-diagnosis
     """
     from evaluation.engines import compare
 
-    for line in compare(sets, beside=beside):
+    for line in compare(sets, with_diagnosis=with_diagnosis):
         print(line, flush=True)
 
 

@@ -13,6 +13,7 @@ from evaluation.draw import recordings_of
 from evaluation.independent_simulator import LISTED, OUTSIDE, ConcealedCamera, Law
 from evaluation.own_chain import healthy_session
 from lab.diagnose import diagnose
+from lab.errors import InputError
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet, read
 from lab.inference.check import HeldOutCheck, check_held_out, passes
@@ -93,17 +94,25 @@ def lines(outcome: Outcome) -> Iterator[str]:
 
 def recordings_named(name: str) -> RecordingSet:
     """Return the recordings of a folder; of `own:SEED`, the healthy session of the forward model; or of
-    `former:LAW:VARIANT:STRENGTH:SEED`, a session of the independent simulator with one law (`healthy` for none)."""
+    `former:LAW:VARIANT:STRENGTH:SEED`, a session of the independent simulator with one law (`former:healthy:SEED` for
+    none). Raises InputError."""
     kind, _, rest = name.partition(":")
-    if kind == "own":
-        return healthy_session([int(rest)])
-    if kind != "former":
+    if kind not in ("own", "former"):
         return read(Path(name))
-    law, *numbers = rest.split(":")
-    if law == "healthy":
-        return recordings_of(ConcealedCamera(int(numbers[0]), rows=ROWS, cols=COLS))
-    variant, strength, seed = int(numbers[0]), float(numbers[1]), int(numbers[2])
-    return recordings_of(ConcealedCamera(seed, (_law(law)(strength, variant),), rows=ROWS, cols=COLS))
+    law, *numbers = rest.split(":") if kind == "former" else ("", rest)
+    wanted = (int,) if law in ("", "healthy") else (int, float, int)
+    try:
+        values = [convert(number) for convert, number in zip(wanted, numbers, strict=True)]
+    except ValueError:
+        raise InputError(
+            f"{name}: isn't own:SEED, former:healthy:SEED or former:LAW:VARIANT:STRENGTH:SEED; give numbers, as "
+            "former:defocus:0:1.5:21"
+        ) from None
+    seed = int(values[-1])
+    if not law:
+        return healthy_session([seed])
+    laws = () if law == "healthy" else (_law(law)(float(values[1]), int(values[0])),)
+    return recordings_of(ConcealedCamera(seed, laws, rows=ROWS, cols=COLS))
 
 
 def _law(name: str) -> type[Law]:
@@ -111,18 +120,18 @@ def _law(name: str) -> type[Law]:
         if law.name == name:
             return law
     known = ", ".join(sorted(law.name for law in (*LISTED, *OUTSIDE)))
-    raise ValueError(f"law {name!r}: isn't known; choose one of {known}")
+    raise InputError(f"law {name!r}: isn't known; choose one of {known}")
 
 
-def compare(names: Sequence[str], *, beside: bool) -> Iterator[str]:
-    """Run the evidence engine on recordings, with `beside` today's diagnosis, too."""
+def compare(names: Sequence[str], *, with_diagnosis: bool) -> Iterator[str]:
+    """Run the evidence engine on recordings, and, `with_diagnosis`, today's diagnosis."""
     for name in names:
         recordings = recordings_named(name)
         yield name
         for side in recordings.sides:
             outcome = ask(recordings, side)
             yield from (f"  {side}: nothing can be measured",) if outcome is None else lines(outcome)
-        if beside:
+        if with_diagnosis:
             begin = time.process_time()
             result = diagnose(recordings, fit_recording_set(recordings), at_once=False)
             named = ", ".join(f"{e.name} {e.probability:.4f}" for e in result.effects) or "nothing"

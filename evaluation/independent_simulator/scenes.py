@@ -22,7 +22,7 @@ FINE = 4  # samples a pixel of a pattern's image
 BOARD_PARTS = 2  # parts along a side that a sample of a board averages
 SUBSAMPLES = 4  # along a side of a sample of a screen
 #: Weights of subsamples: of their mean over a sample, and of that mean taken three times. The latter passes a share of
-#: 2e-3 of what aliases to 0.45 cy/px, beside 0.13.
+#: 2e-3 of what aliases to 0.45 cy/px; the former passes 0.13.
 ONCE = np.full(SUBSAMPLES, 1.0 / SUBSAMPLES)
 THRICE = np.convolve(np.convolve(ONCE, ONCE), ONCE)
 BLOCK_ROWS = 16  # rows of pixels of a screen that are drawn at a time
@@ -178,8 +178,8 @@ def _drawn(
     """Return the means of a screen's cells over samples at `row` (n,) and `col` (m,), px: as they are, (n, m), and
     without what lies above the grid's highest frequency, which would alias.
 
-    `cells`: maps rows and columns, px, to rows and columns of the pattern. Subsamples are joined by `THRICE`, whose
-    response beside that of `ONCE` is divided out."""
+    `cells`: maps rows and columns, px, to rows and columns of the pattern. Subsamples are joined by `THRICE`, and
+    its response relative to that of `ONCE` is divided out."""
     step = 1.0 / (FINE * SUBSAMPLES)
     beyond = (len(THRICE) - SUBSAMPLES) // 2  # subsamples of the neighbours that a sample is joined with
 

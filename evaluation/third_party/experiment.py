@@ -34,8 +34,8 @@ Draw = Callable[[np.random.Generator, DrawnCamera], SimulatedSensor | SimulatedO
 
 @dataclass(frozen=True)
 class Source:
-    """A model of a simulator. `effect`: the library's name of it, None of healthy cameras. `also`: of what the
-    camera has beside it."""
+    """A model of a simulator. `effect`: the library's name of it, None of healthy cameras. `also`: of a
+    second effect of the camera."""
 
     simulator: str
     draw: Draw

@@ -65,7 +65,7 @@ class Silicon(SimulatedSensor):
 
 @dataclass
 class Spread(SimulatedOptics):
-    """A profile of GalSim beside the diffraction of the stated f-number.
+    """A profile of GalSim, convolved with the diffraction of the stated f-number.
 
     profile : pitch (um) -> GalSim's object, in pixels
     transfer : frequency along the row (cy/um) -> modulus of the closed form

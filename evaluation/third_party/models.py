@@ -15,7 +15,7 @@ Kind = Literal["electronic", "optical"]
 
 @dataclass(frozen=True)
 class SimulatorCheck:
-    """The size of an effect in a simulator's own output, by a few lines of numpy, beside what was asked for.
+    """The size of an effect in a simulator's own output, by a few lines of numpy, and the size that was asked for.
 
     tolerance : of the difference, three standard deviations or the simulator's documented error
     """

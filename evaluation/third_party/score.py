@@ -33,7 +33,7 @@ class Diagnosed:
 
     source : name of the simulator's model
     effect : the library's name of it, None of healthy cameras
-    also : effect that the drawn camera has beside it
+    also : a second effect of the drawn camera
     """
 
     source: str
