@@ -8,14 +8,16 @@ from evaluation.engines import recordings_named
 from lab.errors import InputError
 
 
-@pytest.mark.parametrize("name", ["own:x", "own:", "former:healthy", "former:healthy:1:2", "former:defocus:0:strong:21"])
+@pytest.mark.parametrize(
+    "name", ["own:x", "own:", "former:healthy", "former:healthy:1:2", "former:defocus:0:strong:21"]
+)
 def test_a_name_without_its_numbers_is_refused_with_an_example(name: str) -> None:
     with pytest.raises(InputError, match=r"give numbers, as former:defocus:0:1\.5:21"):
         recordings_named(name)
 
 
 def test_an_unknown_law_is_refused_with_those_that_are_known() -> None:
-    with pytest.raises(InputError, match="choose one of absorption_band, .*defocus"):
+    with pytest.raises(InputError, match=r"choose one of absorption_band, .*defocus"):
         recordings_named("former:nolaw:0:1.5:21")
 
 
