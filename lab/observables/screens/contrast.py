@@ -62,15 +62,16 @@ def measure_bernoulli(dataset: Dataset) -> Observable:
         parts.append(b)
     poses = [sights for sights in poses if sights]
     plain = [_transfers(dataset, sights, ()) for sights in poses]
-    weights = {id(p): _node_weights(p) for sights in poses for p, *_ in sights.values()}
+    weights = [[_node_weights(p) for p, *_ in sights.values()] for sights in poses]
 
     def predict(effects: Effects) -> Prediction:
         mean = expected.copy()
         if effects:
-            for sights, before in zip(poses, plain, strict=True):
+            for sights, of_nodes, before in zip(poses, weights, plain, strict=True):
                 changed = _transfers(dataset, sights, effects) / np.where(np.abs(before) > 1e-3, before, np.inf)
-                for (p, members, parts), ratio in zip(sights.values(), changed, strict=True):
-                    real, imaginary, outside = weights[id(p)]
+                for (p, members, parts), (real, imaginary, outside), ratio in zip(
+                    sights.values(), of_nodes, changed, strict=True
+                ):
                     within, beyond = np.split(ratio, [real.shape[1]])
                     placed = _in_place(p, within)
                     change = real @ (np.real(placed) - 1.0) + imaginary @ np.imag(placed)
