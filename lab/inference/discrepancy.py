@@ -30,6 +30,8 @@ _NODES_CORRELATED = 2.0
 #: Distance of the nodes of the transmittance, nm, and their correlation length in nodes: coatings ripple with periods
 #: of some tens of nm.
 _SPECTRAL_STEP_NM, _SPECTRAL_CORRELATED, _MOST_SPECTRAL = 10.0, 1.5, 48
+#: Nodes of the transfer function, cycles a pixel: closer towards 0, where a halo of some pixels acts.
+_TRANSFER_NODES = (0.0, 0.01, 0.03, 0.06, 0.12, 0.2, 0.32, 0.46, 0.64, 0.82, 1.0)
 #: Correlation between two channels, and between two conditions, of one observable.
 _BETWEEN = 0.7
 #: Columns of a group that are kept, by what they may change at its largest scale: variances, in the numbers' noise.
@@ -205,7 +207,7 @@ def _directed(shape: str, at: Sequence[float]) -> _SmoothChange:
 
 
 def _transfer(dataset: Dataset) -> Iterator[_SmoothChange]:
-    at = (np.linspace(0.0, 1.0, 8) / dataset.camera.pixel_pitch_um).tolist()
+    at = (np.array(_TRANSFER_NODES) / dataset.camera.pixel_pitch_um).tolist()
     yield _curve("image", "frequency", "mean", at, first=1)
     for shape in ("astigmatic", "diagonal", "chromatic"):
         yield _directed(shape, at)
