@@ -71,15 +71,16 @@ def measure_bernoulli(dataset: Dataset) -> Observable:
         parts.append(b)
     poses = [sights for sights in poses if sights]
     plain = [_transfers(dataset, sights, ()) for sights in poses]
-    weights = {id(p): _node_weights(p) for sights in poses for p, *_ in sights.values()}
+    weights = [[_node_weights(p) for p, *_ in sights.values()] for sights in poses]
 
     def predict(effects: Effects) -> Prediction:
         mean = expected.copy()
         if effects:
-            for sights, before in zip(poses, plain, strict=True):
+            for sights, of_nodes, before in zip(poses, weights, plain, strict=True):
                 after = _transfers(dataset, sights, effects)
-                for (p, members, parts), otf, plain_otf in zip(sights.values(), after, before, strict=True):
-                    real, imaginary, outside = weights[id(p)]
+                for (p, members, parts), (real, imaginary, outside), otf, plain_otf in zip(
+                    sights.values(), of_nodes, after, before, strict=True
+                ):
                     within = real.shape[1]
                     ratio = otf / np.where(np.abs(plain_otf) > LEAST_TRANSFER, plain_otf, np.inf)
                     placed = _in_place(p, ratio[:within])
