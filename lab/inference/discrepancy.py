@@ -20,6 +20,7 @@ from lab.observables.dataset import Dataset
 from lab.observables.observable import Observable
 from sim.effects.base import Effect
 from sim.effects.empirical_law import PLACES, Along, EmpiricalLaw, Of, Stage
+from sim.effects.screen_gamma import ScreenGamma
 from sim.effects.transfer_discrepancy import TransferDiscrepancy
 from sim.spectrum import FloatArray
 
@@ -52,7 +53,7 @@ class GroupDeclaration:
     observables: tuple[str, ...] = ()
 
 
-TRANSFER, FIELD, SPECTRAL, RESPONSE, SOURCE, OFFSET, SHOT = (
+TRANSFER, FIELD, SPECTRAL, RESPONSE, SOURCE, OFFSET, SHOT, BORDERS = (
     GroupDeclaration(
         "transfer", 0.002, "1, of the transfer function",
         "healthy sets of a simulator with transfer functions in closed form: 0.1 % at most; twice that for real lenses",
@@ -77,6 +78,11 @@ TRANSFER, FIELD, SPECTRAL, RESPONSE, SOURCE, OFFSET, SHOT = (
     GroupDeclaration(
         "shot noise", 0.005, "1, of the temporal variance by level",
         "healthy sets: 1 % is not excluded",
+    ),
+    GroupDeclaration(
+        "borders of cells", 0.05, "1, of the exponent of a screen's light by its drive",
+        "a picture's file doesn't state how wide a screen draws the borders of cells: drawn with samples of 1/3 px, "
+        "they have an exponent of 0.86",
     ),
 )  # fmt: skip
 ON_OBSERVABLES = (
@@ -263,9 +269,13 @@ def _shot(dataset: Dataset) -> Iterator[_SmoothChange]:
     yield _curve("charge", "level", "variance", _levels_e(dataset).tolist())
 
 
+def _borders(_dataset: Dataset) -> Iterator[_SmoothChange]:
+    yield _SmoothChange(lambda _, value: ScreenGamma(exponent=1.0 + value), 1)
+
+
 _ON_STATES: dict[GroupDeclaration, Callable[[Dataset], Iterator[_SmoothChange]]] = {
     TRANSFER: _transfer, FIELD: _field, SPECTRAL: _spectral, RESPONSE: _response, SOURCE: _source, OFFSET: _offset,
-    SHOT: _shot,
+    SHOT: _shot, BORDERS: _borders,
 }  # fmt: skip
 
 
