@@ -33,6 +33,8 @@ _NODES_CORRELATED = 2.0
 _SPECTRAL_STEP_NM, _SPECTRAL_CORRELATED, _MOST_SPECTRAL = 10.0, 1.5, 48
 #: Nodes of the transfer function, cycles a pixel: closer towards 0, where a halo of some pixels acts.
 _TRANSFER_NODES = (0.0, 0.01, 0.03, 0.06, 0.12, 0.2, 0.32, 0.46, 0.64, 0.82, 1.0)
+#: Widths of the borders of a screen's cells at which their exponent varies, px.
+_RIMS_PX = (0.0, 0.3)
 #: Correlation between two channels, and between two conditions, of one observable.
 _BETWEEN = 0.7
 #: Columns of a group that are kept, by what they may change at its largest scale: variances, in the numbers' noise.
@@ -270,7 +272,7 @@ def _shot(dataset: Dataset) -> Iterator[_SmoothChange]:
 
 
 def _borders(_dataset: Dataset) -> Iterator[_SmoothChange]:
-    yield _SmoothChange(lambda _, value: ScreenGamma(exponent=1.0 + value), 1)
+    yield _SmoothChange(lambda k, value: ScreenGamma(exponent=1.0 + value, rim_px=_RIMS_PX[k]), len(_RIMS_PX))
 
 
 _ON_STATES: dict[GroupDeclaration, Callable[[Dataset], Iterator[_SmoothChange]]] = {

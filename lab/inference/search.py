@@ -80,6 +80,8 @@ PAIRS, TRIPLES, EXTENSIONS = 120, 12, 10
 NEAR = 3.0
 #: Scales of the groups, drawn from their posterior, over which a closed form is averaged.
 SCALES_AVERAGED = 7
+#: Departure from linearity, over the change, up to which a Jacobian is updated after a step, not differenced again.
+NEARLY_LINEAR = 0.3
 #: Log evidence by which the largest everyday form error has to exceed the next for larger ones to be tried.
 STEEP = 0.5
 #: Share of healthy draws whose p(nothing) is taken as that of a measured set, the lowest.
@@ -490,14 +492,20 @@ class Search:
         low, high = bounds(coords)
         unit = np.array([c.unit for c in coords])
 
+        last: list[tuple[FloatArray, FloatArray, FloatArray]] = []  # u, whitened residual, whitened Jacobian
+
         def residual(at: FloatArray) -> FloatArray:
             white = gaussian.whiten(y - self.model.mean(moved(state, at)))
             return np.concatenate([white, [c.residual(float(x))[0] for c, x in zip(coords, at, strict=True)]])
 
         def slope(at: FloatArray) -> FloatArray:
             mean = self.model.mean(moved(state, at))
-            white = gaussian.whiten(self._jacobian(moved(state, at), coords, at, mean))
-            return np.vstack([-white, np.diag([c.residual(float(x))[1] for c, x in zip(coords, at, strict=True)])])
+            white = gaussian.whiten(y - mean)
+            table = _updated(last[0], at, white, unit) if last else None
+            if table is None:
+                table = -gaussian.whiten(self._jacobian(moved(state, at), coords, at, mean))
+            last[:] = [(at.copy(), white, table)]
+            return np.vstack([table, np.diag([c.residual(float(x))[1] for c, x in zip(coords, at, strict=True)])])
 
         inside = np.clip(u, low + 1e-9 * unit, high - 1e-9 * unit)
         found = least_squares(
@@ -810,6 +818,20 @@ class Search:
         effects = {n: 1.0 - mass((n,)) / whole for n in gains}
         held = {f: 1.0 - mass(names) / whole for f, names in families.items()}
         return Tail(origin.members, origin.quick + float(np.log(whole)), effects, held)
+
+
+def _updated(
+    last: tuple[FloatArray, FloatArray, FloatArray], at: FloatArray, white: FloatArray, unit: FloatArray
+) -> FloatArray | None:
+    """Return the Jacobian (n, p) of a residual after a step that changed it nearly as the last Jacobian says (Broyden,
+    Math. Comp. 19, 577, 1965); None where it didn't."""
+    u, before, table = last
+    step, change = (at - u) / unit, white - before
+    off = change - table @ (at - u)
+    square = float(step @ step)
+    if square == 0.0 or np.linalg.norm(off) > NEARLY_LINEAR * np.linalg.norm(change):
+        return table if square == 0.0 else None
+    return np.asarray(table + np.outer(off, step / unit) / square)
 
 
 def _differ(one: FittedSet, other: FittedSet) -> bool:
