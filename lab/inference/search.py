@@ -590,7 +590,15 @@ class Search:
         for tau in scales.stratified(unlisted, SCALES_AVERAGED):
             z, square = self._linear(gram, tau)
             ratios.append(signature_log_odds(z, square, signatures))
-        return dict(zip(which, log_mean_exp(np.array(ratios)).tolist(), strict=True)) if which else {}
+        if not which:
+            return {}
+        found = log_mean_exp(np.array(ratios))
+        # several columns are integrated one after the other: only how that depends on the scales is taken from it
+        several = [k for k, s in enumerate(signatures) if len(s.columns) > 1]
+        z, square = self._linear(gram, scales.mode(unlisted))
+        found[several] -= signature_log_odds(z, square, [signatures[k] for k in several])
+        found[several] += [integrate_set(z, square, [signatures[k]])[0] for k in several]
+        return dict(zip(which, found.tolist(), strict=True))
 
     def _near_alternatives(self, origin: FittedSet, owner: str, chosen: int) -> list[tuple[int, FloatArray]]:
         """Return other alternatives of a hypothesis that are nearly as likely as the one chosen."""
