@@ -22,8 +22,6 @@ from lab.inference.laplace import integrate
 from lab.inference.model import Model, ScaleIntegral
 from sim.spectrum import FloatArray
 
-#: Scales of the groups, drawn from their prior, over which healthy draws are averaged; those at which flips are.
-SCALES_DRAWN, SCALES_FLIPPED = 12, 4
 #: Gain of log evidence up to which the recordings say little of a set beyond its nearest refitted subset: the closed
 #: form is as good as a refit there, and the evidences of such members multiply.
 SILENT = 1.0
@@ -251,38 +249,42 @@ class HealthyDraws:
         return replace(self.scales, projected=own[: len(self.scales.gram), 0], _known={}), whole
 
     def screen(
-        self, hypotheses: Iterable[str], signatures: Sequence[Signature], prior: SetPrior, rng: np.random.Generator
-    ) -> FloatArray:
-        """Return p(no effect, nothing unlisted) of all draws, (D,), roughly: scales by a Latin hypercube of their
-        prior, one for all draws; of several columns of a signature the likeliest."""
+        self, hypotheses: Iterable[str], signatures: Sequence[Signature], prior: SetPrior
+    ) -> FloatArray:  # fmt: skip
+        """Return p(no effect, nothing unlisted) of all draws, (D,), roughly and mostly too low: the scales of all other
+        groups are at their medians, so that effects and flips also take what a group with a larger scale left."""
         groups, draws, at = self.scales.groups, self.projected.shape[1], len(self.scales.gram)
-        strata = [(rng.permutation(SCALES_DRAWN) + 0.5) / SCALES_DRAWN for _ in groups]
-        drawn = np.array([g.everyday_quantile(s) for g, s in zip(groups, strata, strict=True)])
-        drawn = drawn.reshape(len(groups), SCALES_DRAWN).T
-        log_likelihood = np.empty((SCALES_DRAWN, draws))
-        odds = np.empty((SCALES_DRAWN, len(signatures), draws))
-        both = np.block([[self.gram, self.projected], [self.projected.T, np.zeros((draws, draws))]])
-        for j, tau in enumerate(drawn):
-            left = project_groups(both, np.repeat(tau, self.scales.group_sizes))
-            split = len(left) - draws
-            log_likelihood[j] = -0.5 * np.diag(left)[split:] - self.scales.log_det(tau)
-            for i, s in enumerate(signatures):
-                each = zip(s.columns, s.coordinates, strict=True)
-                odds[j, i] = np.max([log_odds_of_draws(left[k, split:], float(left[k, k]), c) for k, c in each], axis=0)
-        ratio = log_mean_exp(log_likelihood[:, None, :] + odds) - log_mean_exp(log_likelihood)
+        middle = np.array([float(g.everyday_quantile(np.array(0.5))) for g in groups])
         flips = [np.zeros(draws)]
         for g, group in enumerate(groups):
-            usual, other = group.scales(False), group.scales(True)
-            points = np.concatenate([usual, other])
-            values = np.array([
-                self.scales.profiles(g, tau, points, self.projected[:at])
-                for tau in drawn[:: SCALES_DRAWN // SCALES_FLIPPED]
-            ])  # fmt: skip
-            usual_log = log_mean_exp(values[:, : len(usual)].reshape(-1, draws))
-            other_log = log_mean_exp(values[:, len(usual) :].reshape(-1, draws))
-            flips.append(other_log - usual_log + self.scales.prior_log[1] - self.scales.prior_log[0])
-        gains = gains_of(ratio, hypotheses, signatures)
+            points = [group.scales(u) for u in (False, True)]
+            values = self.scales.profiles(g, middle, np.concatenate(points), self.projected[:at])
+            values += np.log(np.concatenate([group.shares(u) for u in (False, True)]))[:, None]
+            usual, other = np.split(values, [len(points[0])])
+            more = logsumexp(other, axis=0) - logsumexp(usual, axis=0)
+            flips.append(more + self.scales.prior_log[1] - self.scales.prior_log[0])
+        gains = gains_of(self._odds(middle, signatures), hypotheses, signatures)
         return 1.0 / (np.exp(logsumexp(flips, axis=0)) + others_over_empty(gains, prior))
+
+    def _odds(self, tau: FloatArray, signatures: Sequence[Signature]) -> FloatArray:
+        """Log odds of every signature and draw with the groups at these scales, (s, D). Of several columns of a
+        signature the likeliest gains, and the others cost what they do by themselves."""
+        both = np.concatenate([self.gram, self.projected], axis=1)
+        at, draws = len(self.scales.gram), self.projected.shape[1]
+        amplitude = np.repeat(tau, self.scales.group_sizes)
+        inner = np.eye(at) + amplitude[:, None] * self.gram[:at, :at] * amplitude
+        solved = cho_solve(
+            cho_factor(inner, lower=True, check_finite=False), amplitude[:, None] * both[:at, at:], check_finite=False
+        )
+        left = both[at:, at:] - (amplitude[:, None] * self.gram[:at, at:]).T @ solved
+        split = left.shape[1] - draws
+        found = np.empty((len(signatures), draws))
+        for i, s in enumerate(signatures):
+            columns = zip(s.columns, s.coordinates, strict=True)
+            each = np.array([log_odds_of_draws(left[k, split:], float(left[k, k]), c) for k, c in columns])
+            best = each.max(axis=0)
+            found[i] = best + np.minimum(each, 0.0).sum(axis=0) - np.minimum(best, 0.0)
+        return found
 
 
 def gains_of(

@@ -84,8 +84,8 @@ SCALES_AVERAGED = 7
 NEARLY_LINEAR = 0.3
 #: Log evidence by which the largest everyday form error has to exceed the next for larger ones to be tried.
 STEEP = 0.5
-#: Share of healthy draws whose p(nothing) is taken as that of a measured set, the lowest.
-REFINED = 0.03
+#: Healthy draws whose p(nothing) is taken as that of a measured set: so many of the lowest, of so many at most.
+LOWEST, MOST_REFINED = 2, 40
 #: Gain of log evidence up to which a size may be near 0, where shapes vanish.
 WEAK = 6.0
 #: Log evidence within which two alternatives of one hypothesis are both refitted, and the most that are.
@@ -761,12 +761,18 @@ class Search:
         return np.array([taken[list(s.columns)].max() for s in self._signatures])
 
     def healthy_draws(self, draws: int, rng: np.random.Generator) -> FloatArray:
-        """Return p(no effect, nothing unlisted) of draws without either, (draws,), lowest first: by the closed form
-        about the empty set, those that are lowest by a rougher one (`HealthyDraws.screen`)."""
+        """Return p(no effect, nothing unlisted) of draws without either, (draws,), lowest first. The lowest ones are
+        those of the closed form about the empty set, as a measured set's; of the others a rougher one
+        (`HealthyDraws.screen`), which is mostly too low: it is refined from below, until `LOWEST` are below the
+        rest."""
         drawn = HealthyDraws.of(self.model, self._signatures, self.any_unlisted, draws, rng)
-        found = drawn.screen(self.hypotheses, self._signatures, self.prior, rng)
-        for d in np.argsort(found)[: max(int(np.ceil(REFINED * draws)), 1)]:
+        found = drawn.screen(self.hypotheses, self._signatures, self.prior)
+        refined: list[float] = []
+        for d in np.argsort(found)[:MOST_REFINED]:
+            if np.sum(np.array(refined) < found[d]) >= LOWEST:
+                break
             found[d] = self._nothing(*drawn.one(int(d)))
+            refined.append(float(found[d]))
         return np.sort(found)
 
     def _nothing(self, scales: ScaleIntegral, gram: FloatArray) -> float:
