@@ -108,7 +108,7 @@ def _rate(dataset: Dataset, one: FlatLight, channel: str) -> float:
 
 def misstated_levels(fit: CameraFit | None) -> tuple[InconsistentLevel, ...]:
     """Levels whose stated number of photons contradicts the others, as found by the noise fit
-    (`lab.fit.noise.evaluation`)."""
+    (`lab.fit.noise.consistency`)."""
     if fit is None or fit.noise is None:
         return ()
     return tuple(level for level in fit.noise.inconsistent_levels if level.light_unit == "photons" and level.captures)

@@ -10,7 +10,7 @@ import pytest
 
 from lab.errors import InputError
 from lab.fit.noise.dark_current import temperature_law
-from lab.fit.noise.evaluation import fit_transfer
+from lab.fit.noise.transfer import fit_transfer
 from lab.fit.noise.noise_fit import fit_level_table, noise_fit
 from lab.formats.recording_set import DataSheet
 from lab.observables.noise.levels import MeasuredLevel
