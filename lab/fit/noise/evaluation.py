@@ -137,7 +137,7 @@ def transfer_of(
                 continue
             points.append((level, name))
             x.append(own.mean - dark.lines[name].black)
-            v.append(own.temporal_variance)
+            v.append(recorded.pixel_variance_dn2(level, name))
             s.append(own.temporal_variance_std)
             plane.append(index)
             light.append(bright)
