@@ -23,7 +23,6 @@ from lab.formats.recording_set import RecordingSet
 from lab.observables.noise.figures import BLACK_FLOOR_DN
 from lab.observables.noise.repeatability import LAMP_FLOOR
 from lab.observables.spectra.curves import CURVE_ROUGH_STD
-from lab.observables.spectra.narrowband import NARROWBAND_FLOOR
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.optics.imaging import DiffractionLimited
@@ -148,7 +147,7 @@ def _narrowband(camera: CameraModel) -> Iterator[CandidateCapture]:
 
         signal = predict(Hypothesis("", (), camera))
         noise = (signal + camera.read_noise_e**2) / (PIXELS * REPEATS)
-        floor = np.square(signal) * (NARROWBAND_FLOOR**2 + CURVE_ROUGH_STD**2)
+        floor = np.square(CURVE_ROUGH_STD * signal)
         around = {"from_nm": float(centre - 5.0), "to_nm": float(centre + 5.0), "step_nm": 2.5}
         yield CandidateCapture(
             f"narrowband light at {centre:g} nm",
