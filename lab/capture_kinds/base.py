@@ -296,7 +296,7 @@ class Setting(Frozen):
 
     `wavelength_nm`: of the monochromator; 0 is zero order (white light), None keeps its shutter closed. `pattern`: path
     in the session of what the screen shows; None leaves the screen dark. `cell_px`: screen pixels per cell of the
-    pattern."""
+    pattern. `gain_db`: of the cameras; None: the station's."""
 
     target: str | None
     wavelength_nm: float | None = None
@@ -304,6 +304,7 @@ class Setting(Frozen):
     pattern: str | None = None
     cell_px: int = 1
     by_hand: tuple[str, ...] = ()
+    gain_db: float | None = None
 
     @model_validator(mode="before")
     @classmethod
