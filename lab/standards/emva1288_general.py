@@ -27,11 +27,14 @@ from lab.observables.noise.stack import PlaneStatistics
 from lab.observables.weighted_lines import dark_line
 from lab.standards.emva1288_linear import level_deviations, uniformity_deviations
 from lab.standards.standard import Figure, MeasuredSide, Standard
-from lab.standards.tone_steps import level_series, slope_weights
+from lab.standards.tone_steps import level_series, repeated_mean_std, slope_weights
 from sim.spectrum import FloatArray
 
 #: Standard deviations that a slope has to differ from 0 by: below, the level is saturated.
 SLOPE_SIGMA = 3.0
+#: Of a plane's pixels at its highest code, from which on a level is saturated.
+SATURATED_SHARE = 2e-3
+LEAST_UNSATURATED = 3
 #: Decibels of a relative change of 1.
 DECIBEL = 20.0 / np.log(10.0)
 
@@ -42,6 +45,7 @@ class CharacteristicCurve:
 
     `light`: irradiation, photons a pixel or another unit that is proportional to it; `mean`, `mean_std`: DN;
     `variance`, `variance_std`: temporal, DN^2; `spatial`: variance over the pixels, DN^2, NaN where it isn't known.
+    `unsaturated`: number of levels from the darkest before the first that saturates, three or more.
     """
 
     light: FloatArray
@@ -50,11 +54,15 @@ class CharacteristicCurve:
     variance: FloatArray
     variance_std: FloatArray
     spatial: FloatArray
+    unsaturated: int
 
     @cached_property
     def _weights(self) -> FloatArray:
-        """Weights (n, n) of the means in the slope at each level."""
-        return slope_weights(self.light)
+        """Weights (n, n) of the means in the slope at each level; 0 at saturated ones, which no slope rests on."""
+        found = np.zeros((self.light.size, self.light.size))
+        own = slice(0, self.unsaturated)
+        found[own, own] = slope_weights(self.light[own])
+        return found
 
     @cached_property
     def slope(self) -> FloatArray:
@@ -67,8 +75,10 @@ class CharacteristicCurve:
         return np.asarray(np.sqrt(self._weights**2 @ self.mean_std**2))
 
     def input_noise(self, variance: FloatArray) -> FloatArray:
-        """Return the noise at the input (n,), units of light, of output variances (n,); infinite beyond saturation."""
+        """Return the noise at the input (n,), units of light, of output variances (n,); infinite where the curve
+        doesn't rise."""
         rises = self.slope > SLOPE_SIGMA * self.slope_std
+        rises[self.unsaturated :] = False
         noise = np.sqrt(np.maximum(variance, QUANTISATION_DN2))
         return np.where(rises, noise / np.where(rises, self.slope, 1.0), np.inf)
 
@@ -303,6 +313,7 @@ def characteristic_curves(side: MeasuredSide) -> tuple[dict[str, CharacteristicC
     found = {}
     for name, below in dark.plane.items():
         planes = [below, *(stack[name] for stack in series.stacks)]
+        highest = max(one.highest for one in planes)
         line = dark_line(
             at_s,
             np.array([level.plane[name].mean for level in series.darks]),
@@ -310,16 +321,19 @@ def characteristic_curves(side: MeasuredSide) -> tuple[dict[str, CharacteristicC
         )
         grown = (line.rate or 0.0) * (exposure_s - dark.exposure_s)
         signal = np.array([one.mean - below.mean for one in planes])
-        scatter = np.array([np.std(one.frame_means, ddof=1) if one.repeats > 2 else 0.0 for one in planes])
-        own_std = np.array([one.mean_std for one in planes])
-        repeats = np.array([one.repeats for one in planes], float)
+        own_std = np.array([repeated_mean_std(one) for one in planes])
+        saturated = np.array([one.piled_share > SATURATED_SHARE and one.highest >= highest for one in planes])
+        unsaturated = int(np.argmax(saturated)) if saturated.any() else len(planes)
+        if unsaturated < LEAST_UNSATURATED:
+            raise NotDetermined(Emva1288General.name, f"{unsaturated} unsaturated levels; three are needed at least")
         found[name] = CharacteristicCurve(
             light=np.array([0.0, *series.amounts]),
             mean=np.array([one.mean for one in planes]) - grown,
-            mean_std=np.sqrt(np.maximum(own_std**2, scatter**2 / repeats) + (light_std * signal) ** 2),
+            mean_std=np.hypot(own_std, light_std * signal),
             variance=np.array([one.temporal_variance_of_all for one in planes]),
             variance_std=np.array([one.temporal_variance_std for one in planes]),
             spatial=np.array([_spatial_variance(one) for one in planes]),
+            unsaturated=unsaturated,
         )
     return found, series.unit
 

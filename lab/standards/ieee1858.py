@@ -53,8 +53,8 @@ TELEVISION = ViewingCondition("television set", 2000.0, height_mm=600.0)
 
 
 def contrast_sensitivity(frequency_cy_per_deg: Array) -> Array:
-    """Return the eye's contrast sensitivity to luminance (n,) at frequencies (n,), cycles per degree; about 1 at its
-    maximum."""
+    """Return the eye's contrast sensitivity to luminance (n,) at frequencies (n,), cycles per degree; 3.0 at its
+    maximum, at 4 cycles per degree."""
     f = np.asarray(frequency_cy_per_deg, float)
     return np.asarray(CSF_A * f**CSF_C * np.exp(-CSF_B * f) / CSF_K)
 
@@ -93,7 +93,7 @@ class Ieee1858(Standard):
     title: ClassVar[str] = "acutance of a slanted edge for stated viewing conditions"
 
     def __init__(self, side: MeasuredSide, edge: EdgeRecord) -> None:
-        super().__init__(side, f"{edge.capture.id}, {edge.channel}")
+        super().__init__(side, edge.name)
         self.edge = edge
 
     def _acutance(self, condition: ViewingCondition) -> Estimate:
@@ -168,9 +168,9 @@ class Ieee1858(Standard):
                     channel=self.edge.channel,
                 ),
                 PlotCurve(
-                    label="contrast sensitivity of the eye",
+                    label="contrast sensitivity of the eye, over its maximum",
                     x=tuple(f.tolist()),
-                    y=tuple(contrast_sensitivity(f).tolist()),
+                    y=tuple((contrast_sensitivity(f) / contrast_sensitivity(np.array([CSF_C / CSF_B]))).tolist()),
                     style="dashed",
                 ),
             ),

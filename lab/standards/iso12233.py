@@ -159,10 +159,13 @@ def _edge_positions(values: FloatArray, window: Window, order: int) -> FloatArra
     slope = np.zeros_like(values)
     slope[:, 1:-1] = 0.5 * (values[:, 2:] - values[:, :-2])
     centre = np.full(lines, (n - 1) / 2.0)
-    fine = _window(window, 2 * n + 1)
     for number in range(2):
-        weight = np.stack([np.interp(at - c, np.arange(-n, n + 1), fine) for c in centre])
-        found = (slope * weight) @ at / (slope * weight).sum(axis=1)
+        # a window about the edge, as wide as reaches the farther border
+        away = (at[None, :] - centre[:, None]) / np.maximum(centre, n - 1.0 - centre)[:, None]
+        cosine = np.cos(np.pi * np.clip(away, -1.0, 1.0))
+        weight = 0.5 + 0.5 * cosine if window == "tukey" else 0.54 + 0.46 * cosine
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = (slope * weight) @ at / (slope * weight).sum(axis=1)
         if not np.all(np.isfinite(found)):
             raise NotDetermined("e-SFR", "a line of the region has no edge: narrow the region to the edge")
         degree = min(order if number else 1, max(lines // 20, 1))
@@ -181,6 +184,15 @@ class EdgeRecord:
     summary: EdgeSummary
     samples: FloatArray
     pitch_px: int
+
+    @property
+    def name(self) -> str:
+        """The capture and the channel, with the middle of a region that was found."""
+        own = f"{self.capture.id}, {self.channel}"
+        if self.capture.region is not None:
+            return own
+        row0, col0, row1, col1 = self.region
+        return f"{own} at row {(row0 + row1) // 2}, column {(col0 + col1) // 2}"
 
     @cached_property
     def unbiased(self) -> EdgeMtf:
@@ -233,9 +245,7 @@ class Iso12233(Standard):
     title: ClassVar[str] = "spatial frequency response of a slanted edge"
 
     def __init__(self, side: MeasuredSide, edge: EdgeRecord) -> None:
-        row0, col0, row1, col1 = edge.region
-        at = f"rows {row0} to {row1 - 1}, columns {col0} to {col1 - 1}"
-        super().__init__(side, f"{edge.capture.id}, {edge.channel}, {at}")
+        super().__init__(side, edge.name)
         self.edge = edge
 
     @cached_property
@@ -359,7 +369,11 @@ class Iso12233(Standard):
     def conditions(self) -> Iterator[str]:
         lines, samples = self.edge.samples.shape
         yield f"{lines} lines of {samples} samples, raw data (linear: no OECF is inverted)"
-        yield f"edge at {self.edge.summary.angle_deg:.2f}° from the vertical"
+        row0, col0, row1, col1 = self.edge.region
+        yield (
+            f"{self.edge.name}: rows {row0} to {row1 - 1}, columns {col0} to {col1 - 1}, edge at "
+            f"{self.edge.summary.angle_deg:.2f}° from the vertical"
+        )
 
     def remarks(self) -> Iterator[str]:
         hamming = self.edge.e_sfr("hamming", 1)
@@ -468,12 +482,17 @@ class Iso12233Field(Standard):
         """
         return self._weighted([min(self._each, key=lambda one: one[2])])
 
+    def deviations(self) -> Iterator[Deviation]:
+        yield from {one.line: one for edge in self.edges for one in edge.deviations()}.values()
+
     def maps(self) -> Iterator[StandardMap]:
         camera = self.measured.camera
         cells: dict[tuple[int, int], list[float]] = {}
         for row, col, value, _ in self._each:
             place = (int(MAP_ROWS * row / camera.rows), int(MAP_COLS * col / camera.cols))
             cells.setdefault(place, []).append(value)
+        if len(cells) < 2:
+            return
         yield StandardMap(
             title="SFR50 over the frame",
             unit="cy/px",

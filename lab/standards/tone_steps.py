@@ -114,6 +114,13 @@ def level_series(side: MeasuredSide, step: str) -> LevelSeries:
     )
 
 
+def repeated_mean_std(plane: PlaneStatistics) -> float:
+    """Return the standard deviation of a level's mean, DN: by the noise of its pixels, or by the scatter of its
+    repeats' means, where that is larger, as of a lamp that flickers."""
+    scatter = float(np.std(plane.frame_means, ddof=1)) / float(np.sqrt(plane.repeats)) if plane.repeats > 1 else 0.0
+    return max(plane.mean_std, scatter)
+
+
 def tone_steps(side: MeasuredSide, step: str) -> list[ToneSteps]:
     """Return the levels of the longest series of flats by plane. Raises NotDetermined of `step` with fewer than four
     levels or without darks, in repeats each."""
@@ -134,7 +141,7 @@ def tone_steps(side: MeasuredSide, step: str) -> list[ToneSteps]:
                 exposure_unit=series.unit,
                 signal=signal,
                 signal_std=np.sqrt(
-                    np.array([plane.mean_std for plane in planes]) ** 2
+                    np.array([repeated_mean_std(plane) for plane in planes]) ** 2
                     + dark.mean_std**2
                     + (series.amount_std * signal) ** 2
                 ),

@@ -32,7 +32,7 @@ def camera(
     if rng is not None:
         mean = mean + mean_std * rng.standard_normal(light.size)
         variance = variance + variance_std * rng.standard_normal(light.size)
-    return CharacteristicCurve(light, mean, mean_std, variance, variance_std, np.full(light.size, 4.0))
+    return CharacteristicCurve(light, mean, mean_std, variance, variance_std, np.full(light.size, 4.0), int(lit.sum()))
 
 
 def test_linear_camera_has_the_closed_forms() -> None:
