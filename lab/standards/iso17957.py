@@ -34,9 +34,14 @@ class Blocks:
     level: float
 
     @property
+    def luminance_channel(self) -> str:
+        """Green, or the only channel."""
+        return "G" if "G" in self.mean else next(iter(self.mean))
+
+    @property
     def luminance(self) -> tuple[FloatArray, FloatArray]:
-        """Green, or the only channel: its blocks over the central one, and standard deviations."""
-        return self.ratio("G" if "G" in self.mean else next(iter(self.mean)), None)
+        """Its blocks over the central one, and standard deviations."""
+        return self.ratio(self.luminance_channel, None)
 
     def ratio(self, channel: str, other: str | None) -> tuple[FloatArray, FloatArray]:
         """Blocks of a channel, over those of another where one is given, over the central one; and their standard
@@ -85,13 +90,14 @@ class Iso17957(Standard):
         Clause: 6. Symbol: S_L.corner. Unit: %.
         Formula: 100 (mean of the four corner blocks / L_centre − 1).
         """
-        value, std = self.blocks.luminance
-        corners = value[[0, 0, -1, -1], [0, -1, 0, -1]]
-        return Estimate(
-            value=100.0 * float(corners.mean() - 1.0),
-            std=100.0 * float(np.sqrt(np.sum(std[[0, 0, -1, -1], [0, -1, 0, -1]] ** 2))) / 4.0,
-            unit="%",
-        )
+        channel = self.blocks.luminance_channel
+        mean, std = self.blocks.mean[channel], self.blocks.std[channel]
+        corners, middle = ([0, 0, -1, -1], [0, -1, 0, -1]), BLOCKS // 2
+        ratio = float(mean[corners].mean() / mean[middle, middle])
+        # the error of the central block is common to the four
+        own = float(np.sqrt(np.sum(std[corners] ** 2))) / float(mean[corners].sum())
+        relative = float(np.hypot(own, std[middle, middle] / mean[middle, middle]))
+        return Estimate(value=100.0 * (ratio - 1.0), std=100.0 * ratio * relative, unit="%")
 
     def _colour(self, channel: str) -> Estimate:
         if channel not in self.blocks.mean:
