@@ -31,6 +31,7 @@ from lab.formats.results.diagnosis import (
     VetoedName,
     Visibility,
 )
+from lab.formats.results.estimate import Estimate
 from lab.formats.results.fit import (
     BoardWarp,
     CameraFit,
@@ -64,6 +65,15 @@ from lab.formats.results.fit import (
     StereoFit,
     ViewResiduals,
 )
+from lab.formats.results.standards import (
+    Deviation,
+    PlotCurve,
+    StandardFigure,
+    StandardMap,
+    StandardPlot,
+    StandardReading,
+    StandardsResult,
+)
 from lab.formats.results.validation import (
     Change,
     Check,
@@ -90,6 +100,7 @@ __all__ = [
     "DarkCurrentLaws",
     "Defect",
     "DepthUncertainty",
+    "Deviation",
     "DiagnosisLists",
     "DiagnosisResult",
     "DiagnosisVerdict",
@@ -99,6 +110,7 @@ __all__ = [
     "EffectSet",
     "Emva1288",
     "Emva1288Points",
+    "Estimate",
     "ExaminedPlace",
     "FitResult",
     "GeometryFit",
@@ -118,6 +130,7 @@ __all__ = [
     "PatchComparison",
     "PhotonTransfer",
     "PixelDefects",
+    "PlotCurve",
     "PolicyRule",
     "ProjectionChange",
     "ProjectionUncertainty",
@@ -137,6 +150,11 @@ __all__ = [
     "SideModels",
     "Skipped",
     "SpectralFit",
+    "StandardFigure",
+    "StandardMap",
+    "StandardPlot",
+    "StandardReading",
+    "StandardsResult",
     "StereoFit",
     "Unexplained",
     "ValidationResult",

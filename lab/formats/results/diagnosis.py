@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+from lab.formats.results.estimate import Estimate
 from lab.formats.results.fit import Skipped
 from lab.shown import Tabular
 from sim.camera import Side
@@ -27,16 +28,13 @@ class Mismatch(Frozen):
     captures: tuple[str, ...]
 
 
-class ParameterValue(Frozen):
+class ParameterValue(Estimate):
     """An estimated parameter of an effect.
 
     `sign_known`: False where the recordings show its size only, as it acts by its square. `interval`: from low to high,
     95 %, of a value whose error no normal distribution describes; it has no standard deviation.
     """
 
-    value: float
-    std: float | None
-    unit: str
     sign_known: bool = True
     interval: tuple[float, float] | None = None
 
