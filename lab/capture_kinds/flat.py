@@ -22,6 +22,7 @@ from lab.capture_kinds.base import (
     spectrum_path,
 )
 from lab.capture_kinds.irradiance import IrradianceCapture
+from lab.capture_kinds.lamp import LAMP_INSTRUMENTS, ColourTemperature, LampLevel, check_lamp, lamp_channels, lamp_words
 from sim.parameters import Quantity
 from sim.scene.scenes import Scene, UniformField
 from sim.spectrum import Spectrum
@@ -48,7 +49,9 @@ class FlatSequence(Sequence):
     Each camera has exposures of its own, scaled from that found for `level_found`. The series of levels is taken
     upwards and downwards in turn. The radiance is measured before each turn, so that a drift of the lamp shows as a
     difference between turns. `wavelength_nm`: of the light, 0 is white; with one wavelength a photodiode measures the
-    irradiance before each frame (EMVA 1288)."""
+    irradiance before each frame (EMVA 1288). With a `lamp_level` above 0 the light source lights the sphere in place of
+    the monochromator: its light of `colour_temperature_k`, or of `wavelength_nm`, else the first of the station
+    file."""
 
     name: ClassVar[str] = "flat"
     purpose: ClassVar[str] = "conversion gain, PRNU, full well, linearity (photon transfer)"
@@ -61,24 +64,33 @@ class FlatSequence(Sequence):
     frames: Annotated[int, Quantity("1", "frames at each level", lower=1, upper=20_000)]
     level_found: Level = 0.75
     wavelength_nm: Annotated[float, Quantity("nm", "wavelength of the light; 0: white", lower=0.0, upper=5000.0)] = 0.0
+    lamp_level: LampLevel = 0.0
+    colour_temperature_k: ColourTemperature = None
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:
+        check_lamp(self.lamp_level, self.colour_temperature_k)
         check_number(len(self.levels) * self.frames)
         return self
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
-        if station.lacks(*cls.instruments):
-            return None
         levels = QUICK_LEVELS if quick else LEVELS
+        if station.lacks(*cls.instruments):
+            return None if station.lacks(*LAMP_INSTRUMENTS) else cls(levels=levels, frames=4, lamp_level=1.0)
         return cls(levels=levels, frames=4, wavelength_nm=station.limits.flat_wavelength_nm or 0.0)
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
-        self.check_instruments(station)
-        slit_um = station.limits.slit_um if self.wavelength_nm else None
-        lit = Setting(target=station.one(SphereTarget), wavelength_nm=self.wavelength_nm, slit_um=slit_um)
-        stem = f"flat/{self.wavelength_nm:g}nm" if self.wavelength_nm else "flat"
+        sphere, stem = SphereTarget, f"flat/{self.wavelength_nm:g}nm" if self.wavelength_nm else "flat"
+        if self.lamp_level:
+            self.check_instruments(station, LAMP_INSTRUMENTS)
+            channels = lamp_channels(station, self.lamp_level, self.colour_temperature_k, self.wavelength_nm)
+            lit = Setting(target=station.one(sphere), lamp=channels)
+            stem = f"{stem}/{lamp_words(self.lamp_level, self.colour_temperature_k)}"
+        else:
+            self.check_instruments(station)
+            slit_um = station.limits.slit_um if self.wavelength_nm else None
+            lit = Setting(target=station.one(sphere), wavelength_nm=self.wavelength_nm, slit_um=slit_um)
         found = exposure_step(stem, "flat field", lit, self.level_found, measures_light=False)
         made = [found]
         for frame in range(1, self.frames + 1):
@@ -100,6 +112,7 @@ class FlatSequence(Sequence):
                                 kind="flat",
                                 radiance=spectrum_path(light),
                                 wavelength_nm=self.wavelength_nm or None,
+                                colour_temperature_k=self.colour_temperature_k,
                                 **planned_keys(id, side),
                             )
                             for side in station.sides
