@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,13 +19,15 @@ from lab.capture.store import Store
 from lab.capture_kinds.flat import FlatSequence
 from lab.formats.recording_set import RecordingSet, inspect
 from mocks.bench import Bench
+from mocks.conceal import Concealed
+from mocks.cornerstone260 import MockCornerstone260
 from mocks.pe4000 import LEDS, MockPe4000
 from mocks.specbos1211 import MockSpecbos1211
 from mocks.stage import MockStage
 from mocks.targets import station_lights
 from mocks.truth import hidden_truth
 from mocks.usb import serve_usbip, stereo_pair
-from mocks.wire import Endpoint, Fault, Grammar, Pty, Tcp, serve
+from mocks.wire import Endpoint, Grammar, Pty, Tcp, serve
 from sim.sensor import mosaic
 from sim.uniform import electron_rate
 
@@ -31,10 +35,19 @@ SHAPE = (60, 80)
 
 
 class LampStation:
-    """A bench of small frames with the light source on a line, and its station without a monochromator."""
+    """A bench of small frames with its light source, radiometer, stage and left camera on lines, and their station;
+    `monochromator`: with one."""
 
-    def __init__(self, folder: Path, running: contextlib.ExitStack, faults: tuple[Fault, ...] = ()) -> None:
-        self.place = Bench(seed=3, concealed={}, shape=SHAPE)
+    def __init__(
+        self,
+        folder: Path,
+        running: contextlib.ExitStack,
+        *,
+        concealed: Concealed | None = None,
+        shape: tuple[int, int] = SHAPE,
+        monochromator: bool = False,
+    ) -> None:
+        self.place = Bench(seed=3, concealed=concealed or {}, shape=shape, session_clock=time.time)
         self.lamp = MockPe4000(self.place)
         stop = threading.Event()
         running.callback(stop.set)
@@ -43,21 +56,22 @@ class LampStation:
             "light_source": (self.lamp, Pty(folder / "lamp"), "pe4000"),
             "stage": (MockStage(self.place), Tcp("127.0.0.1", 0), "operator"),
         }
-        table: dict[str, object] = {}
+        if monochromator:
+            lines["monochromator"] = (MockCornerstone260(self.place), Pty(folder / "monochromator"), "cornerstone260")
+        table: dict[str, Any] = {}
         for name, (grammar, endpoint, driver) in lines.items():
             ready = threading.Event()
             options = {"announce": lambda address, ready=ready: ready.set()}
-            options |= {"faults": faults} if name == "light_source" else {}
             threading.Thread(target=serve, args=(grammar, endpoint, stop), kwargs=options, daemon=True).start()
             assert ready.wait(30)
             table[name] = {"driver": driver, "address": endpoint.address}
-        table["light_source"] = {**table["light_source"], "lights": station_lights()}  # type: ignore[dict-item]
+        table["light_source"] = {**table["light_source"], "lights": station_lights()}
         cameras = stereo_pair(self.place)
         server = running.enter_context(serve_usbip(cameras))
         sheet = self.place.station_cameras()["left"]
         address = server.url(cameras[0].identity.serial_number)
         camera = {"driver": "u3v", "address": address, "timeout_s": 60.0, "datasheet": sheet}
-        targets = {"cap": {"kind": "cap"}, "sphere": {"kind": "sphere"}}
+        targets = self.place.station_targets()
         self.station = Station.model_validate(table | {"cameras": {"left": camera}, "targets": targets})
 
     def is_dark(self) -> bool:
