@@ -73,14 +73,17 @@ class TwoStageWarmUp(SourceDrift):
     rest. Its end is 4.5 % short of the one time constant's that is stated."""
 
     def on_light(self, light: Light) -> Light:
-        if not 0.0 < self.settling_min < SETTLES_NEVER_MIN:
+        if self.drift_percent_per_min == 0.0 or self.settling_min == SETTLES_NEVER_MIN:
             return super().on_light(light)
-        slow = self.replace_fields(drift_percent_per_min=0.94 * self.drift_percent_per_min)
-        fast = SourceDrift(
-            drift_percent_per_min=0.06 * self.drift_percent_per_min, settling_min=0.25 * self.settling_min
-        )
-        laws = [law for part in (SourceDrift(**dict(slow)), fast) for law in part.on_light(light).level]
-        return light.add_laws(level=lambda elapsed_s: 1.0 + sum(law(elapsed_s) - 1.0 for law in laws))
+
+        def level(elapsed_s: float) -> float:
+            settled = [
+                share * settling_min * -float(np.expm1(-elapsed_s / 60.0 / settling_min))
+                for share, settling_min in ((0.94, self.settling_min), (0.06, 0.25 * self.settling_min))
+            ]
+            return 1.0 + self.drift_percent_per_min / 100.0 * sum(settled)
+
+        return light.add_laws(level=level)
 
 
 class BendingLampAgeing(LampAgeing):

@@ -162,6 +162,10 @@ class Capture(Open):
     lamp_levels: dict[str, Annotated[float, Field(ge=0, le=1)]] | None = None  # shares by channel of the light source
     colour_temperature_k: float | None = Field(default=None, gt=0)  # of the light source's light, as the lab states it
 
+    def __hash__(self) -> int:
+        """Of its id and its frame: equal captures have equal ones, and a capture may hold mappings."""
+        return hash((self.id, self.side, self.frame))
+
     @classmethod
     def unsupported(cls, document: dict[str, Any]) -> str | None:
         """Why this version skips a capture that the format allows; None if it is supported."""

@@ -4,6 +4,7 @@
 """
 
 from lab.formats.results.diagnosis import (
+    Combination,
     DiagnosisLists,
     DiagnosisResult,
     DiagnosisVerdict,
@@ -83,6 +84,7 @@ __all__ = [
     "ChannelGeometry",
     "ChannelNoise",
     "Check",
+    "Combination",
     "ComparisonResult",
     "CornerErrors",
     "CrossValidation",

@@ -248,3 +248,13 @@ def test_the_driver_gets_its_own_keys_alone() -> None:
     found = drivers_of(made).light_source
     assert found is not None and getattr(found, "load_timeout_s", None) == 3.0
     assert "light_source" in made.devices and "/dev/none" in made.addresses
+
+
+def test_a_capture_in_the_lamps_light_is_as_hashable_as_any_other(tmp_path: Path) -> None:
+    store, bench = Store(tmp_path / "data"), LampBench()
+    session = started(store, CapturePlan((FLAT,)), bench)
+    session.run()
+    captures = store.recording_set(session.id).captures()
+    assert len(set(captures)) == len(captures) == len({hash(one) for one in captures})
+    assert hash(captures[0]) == hash(captures[0].model_copy())
+    store.close()
