@@ -8,12 +8,14 @@ import numpy as np
 from scipy import special
 
 from lab.diagnose.inference.weigh import Candidate
+from lab.diagnose.outcome.determined import is_determined, sum_words
 from lab.diagnose.outcome.goodness_of_fit import set_sentences, told_as
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
 from lab.effect_titles import effect_title
 from lab.formats.results import (
+    Combination,
     DiagnosisLists,
     DiagnosisResult,
     DiagnosisVerdict,
@@ -106,21 +108,26 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
             told, unit = told_as(field, quantity, gain_is_known=bool(in_electrons))
             is_signed = all(field not in c.unsigned for c in candidates)
             interval = _interval(field, candidates)
+            is_size = quantity.absent is not None and field not in kind.shapes
             parameters[told] = ParameterValue(
-                value=value, std=None if interval else std, unit=unit, sign_known=is_signed, interval=interval
+                value=value,
+                std=None if interval else std,
+                unit=unit,
+                sign_known=is_signed,
+                interval=interval,
+                is_determined=not is_size or is_determined(value, quantity.absent or 0.0, std, interval),
             )
         chosen = [_choices(c.effect, c.alike) for c in candidates]
         choices = {
             field: " and ".join(dict.fromkeys(one[field] for one in chosen if field in one)) for field in chosen[0]
         }
+        combined = tuple(c for _, one in members if one.candidate in candidates for c in one.combinations)
         shown_in = tuple(dict.fromkeys(measurement for _, one in members for measurement in one.shown_in))
         shown = sorted({measurement_title(measurement) for measurement in shown_in})
         values = ", ".join(
             (
-                *(
-                    f"{_plain_name(f, p.unit)} {measured(p.value, p.std, p.unit, p.interval)}"
-                    for f, p in parameters.items()
-                ),
+                *(_size(f, p) for f, p in parameters.items()),
+                *(_combined(c) for c in combined),
                 *(f"{f} {value}".replace("_", " ") for f, value in choices.items()),
             )
         )
@@ -147,6 +154,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
                 probability=min(one.candidate.probability for _, one in members),
                 sides=sides,
                 parameters=parameters,
+                combinations=combined,
                 choices=choices,
                 modes=modes,
                 shown_in=shown_in,
@@ -203,6 +211,18 @@ def _family_statement(
 def _plain_name(field: str, unit: str) -> str:
     """Return a parameter's name in words, without its unit."""
     return field.removesuffix("_" + unit.lower()).replace("_", " ")
+
+
+def _size(field: str, value: ParameterValue) -> str:
+    """Return a parameter in words, with what its interval tells."""
+    text = f"{_plain_name(field, value.unit)} {measured(value.value, value.std, value.unit, value.interval)}"
+    return text if value.is_determined else f"{text}, not determined"
+
+
+def _combined(one: Combination) -> str:
+    """Return in words what the recordings determine of parameters that they can't tell apart."""
+    names = [f"{name}^{one.power}" if one.power > 1 else name for name in one.parameters]
+    return f"{sum_words(names, one.weights)} = {measured(one.value, one.std, one.unit)} is, of the {one.side} camera"
 
 
 def _interval(field: str, candidates: Sequence[Candidate]) -> tuple[float, float] | None:

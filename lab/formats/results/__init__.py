@@ -4,6 +4,7 @@
 """
 
 from lab.formats.results.diagnosis import (
+    Combination,
     DiagnosisLists,
     DiagnosisResult,
     DiagnosisVerdict,
@@ -93,6 +94,7 @@ __all__ = [
     "ChannelGeometry",
     "ChannelNoise",
     "Check",
+    "Combination",
     "ComparisonResult",
     "CornerErrors",
     "CrossValidation",

@@ -32,11 +32,29 @@ class ParameterValue(Estimate):
     """An estimated parameter of an effect.
 
     `sign_known`: False where the recordings show its size only, as it acts by its square. `interval`: from low to high,
-    95 %, of a value whose error no normal distribution describes; it has no standard deviation.
+    95 %, of a value whose error no normal distribution describes; it has no standard deviation. `is_determined`: False
+    where its interval holds the value at which the effect is absent: its size isn't determined, the name stands.
     """
 
     sign_known: bool = True
     interval: tuple[float, float] | None = None
+    is_determined: bool = True
+
+
+class Combination(Frozen):
+    """What the recordings determine of parameters that they can't tell apart: the sum of `weights` times `parameters`,
+    each less its value in absence and raised to `power`, with the size's own sign.
+
+    The weights are the direction; the first is 1, and the unit that of the first parameter to that power.
+    """
+
+    side: Side
+    parameters: tuple[str, ...]
+    weights: tuple[float, ...]
+    power: int
+    value: float
+    std: float
+    unit: str
 
 
 class Rival(Frozen):
@@ -58,9 +76,9 @@ class NamedEffect(Frozen):
 
     `law`: `exact` where what the effects leave is within noise and the laws' tolerances, else `inexact`. `members`:
     where the family is named, its effects, likeliest first; `name` is then the family's identifier, and `parameters`
-    are those of the first member. `choices`: which of its alternatives the law is, by field: the corner of a glow.
-    `modes`: other values of the parameters, in their units, that fit as well. `shown_in`: measurements in which it
-    stands out of the noise, strongest first.
+    are those of the first member. `combinations`: of parameters that aren't determined by themselves. `choices`: which
+    of its alternatives the law is, by field: the corner of a glow. `modes`: other values of the parameters, in their
+    units, that fit as well. `shown_in`: measurements in which it stands out of the noise, strongest first.
     """
 
     name: str
@@ -70,6 +88,7 @@ class NamedEffect(Frozen):
     probability: float
     sides: tuple[Side, ...]
     parameters: dict[str, ParameterValue]
+    combinations: tuple[Combination, ...] = ()
     choices: dict[str, str] = {}
     modes: tuple[dict[str, float], ...] = ()
     shown_in: tuple[str, ...] = ()
