@@ -28,6 +28,7 @@ from lab.formats.results.diagnosis import (
     RivalOdds,
     SideModels,
     Unexplained,
+    Unlisted,
     VetoedName,
     Visibility,
 )
@@ -139,6 +140,7 @@ __all__ = [
     "SpectralFit",
     "StereoFit",
     "Unexplained",
+    "Unlisted",
     "ValidationResult",
     "VetoedName",
     "ViewResiduals",
