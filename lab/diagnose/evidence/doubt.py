@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from lab.capture_kinds.base import Equipment
 from lab.diagnose.evidence.causes import NOTHING
 from lab.diagnose.evidence.side_table import SideTable
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
 from lab.diagnose.outcome.next_capture import WITH, Doubt, OpenCapture
 from lab.inference.hypotheses import moved, stacked
@@ -34,7 +36,9 @@ def doubt_of(reading: SideTable, station: Equipment | None = None) -> Doubt | No
     total = sum(p for _, p in rivals)
     captures = tuple(
         OpenCapture(candidate.words, candidate.forecast(hypotheses), candidate.plan, candidate.needs)
-        for candidate in candidate_captures(reading.recordings, reading.side, reading.used, station)
+        for candidate in candidate_captures(
+            reading.recordings, reading.side, _with_form_errors(reading, rivals), station
+        )
     )
     odds = tuple(p / total for _, p in rivals)
     return Doubt(reading.side, tuple(h.name for h in hypotheses), odds, captures)
@@ -54,7 +58,6 @@ def _hypothesis(reading: SideTable, fit: FittedSet, common: frozenset[str]) -> H
     """Return a set as one of several rivals, which have the effects `common` all together."""
     effects = reading.effects_of(fit.state)
     own = tuple(e for e in effects if e.name not in common)
-    beside = tuple(e for e in effects if e.name in common)
     always = reading.used.always
     estimates = reading.used.nuisance_estimates(effects)
     curves = {c: freed_curve(q, c, estimates) for c, q in reading.used.camera.quantum_efficiency.items()}
@@ -63,9 +66,20 @@ def _hypothesis(reading: SideTable, fit: FittedSet, common: frozenset[str]) -> H
         effects=(*always, *effects),
         camera=reading.used.camera.model_copy(update={"quantum_efficiency": curves}),
         displaced=tuple((*always, *one) for one in _displaced(reading, fit)),
-        beside=(*always, *beside) if own else None,
-        law_std=max((e.form_tolerance for e in own), default=0.0),
+        law_stds={e.name: e.form_tolerance for e in effects},
     )
+
+
+def _with_form_errors(reading: SideTable, rivals: Sequence[tuple[FittedSet, float]]) -> MeasurementModel:
+    """Return the model of the used numbers with the form errors of the likeliest rival's laws in their covariance: two
+    sets that fit the same numbers as well as their laws allow don't differ by what these leave."""
+    fit = max(rivals, key=lambda rival: rival[1])[0]
+    gaussian = reading.model.gaussian(fit.state, 1.0)
+    blocks = tuple(
+        replace(block, covariance=own.covariance)
+        for block, own in zip(reading.used.blocks, gaussian.blocks, strict=True)
+    )
+    return replace(reading.used, blocks=blocks, _predictions={}, _covariances={}, _numbers={})
 
 
 def _displaced(reading: SideTable, fit: FittedSet) -> Iterator[tuple[Effect, ...]]:

@@ -16,10 +16,11 @@ import numpy as np
 
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.refit import Coordinate, coordinate_prior, coordinates, moved, refit
+from lab.diagnose.inference.refit import refit
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior, NameInDoubt, RivalModel, StoredEffect
+from lab.inference.coordinates import EffectCoordinate, coordinate_prior, coordinates, moved
 from lab.observables.charts.chart import CHART
 from lab.observables.charts.patches import reflectance_covariance
 from lab.observables.flats.noise import GAIN_STD, NOISE
@@ -165,12 +166,14 @@ def with_unnamed(effects: Sequence[Effect], posterior: ModelPosterior) -> tuple[
     return (*effects, *(library()[name]() for name in more if name in library() and name not in there))
 
 
-def coordinate_name(effects: Sequence[Effect], coordinate: Coordinate) -> str:
+def coordinate_name(effects: Sequence[Effect], coordinate: EffectCoordinate) -> str:
     """Return how a posterior calls the parameter of an effect."""
     return f"{effects[coordinate.index].name}.{coordinate.name}"
 
 
-def effect_jacobian(model: MeasurementModel, effects: Sequence[Effect], coords: Sequence[Coordinate]) -> FloatArray:
+def effect_jacobian(
+    model: MeasurementModel, effects: Sequence[Effect], coords: Sequence[EffectCoordinate]
+) -> FloatArray:
     """Derivatives (n, p) of the predicted numbers by the coordinates of the effects' parameters, by differences within
     the bounds."""
     columns = [np.zeros((len(model.value), 0))]
