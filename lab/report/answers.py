@@ -365,6 +365,7 @@ def context(
         "headline": headline,
         "answers": answers(fit, validation, diagnosis, left_out, warnings, both),
         "odds": odds(diagnosis),
+        "odds_are_whole": diagnosis is not None and diagnosis.engine == "evidence",
         "proofs": proofs(fit, diagnosis, both),
         "strip": strip(fit),
     }

@@ -274,7 +274,7 @@ def unresolved(reading: SideTable, before: Sequence[Slice], mismatches: Sequence
 
 
 def held_out_of(reading: SideTable) -> HeldOut | None:
-    """Return chi2 of all held-out captures: by the empty set, and by the whole table."""
+    """Return chi2 of all held-out captures: by the baseline, and by the whole table."""
     if not reading.checked:
         return None
     return HeldOut(
@@ -287,7 +287,7 @@ def held_out_of(reading: SideTable) -> HeldOut | None:
 
 def measurement_fits(reading: SideTable, after: Gaussian) -> Iterator[MeasurementFit]:
     """Yield chi2 of every measurement: of its used numbers under the empty set and the improved one; of its held-out
-    ones given the used, by the empty set and by the whole table."""
+    ones given the used, by the baseline and by the whole table."""
     model = reading.used
     held_before = {c.measurement: c for c in reading.unchanged}
     held_after = {c.measurement: c for c in reading.checked}

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from lab.diagnose.evidence.places import (
     unlisted_of,
     unresolved,
 )
-from lab.diagnose.evidence.side_table import SideTable
+from lab.diagnose.evidence.side_table import SideTable, predict_by_baseline
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.outcome.improved_model import residual_pictures
 from lab.diagnose.outcome.mismatches import impossible_efficiency, misstated_light
@@ -46,7 +46,6 @@ from lab.formats.results import (
 from lab.inference.check import check_held_out, passes
 from lab.inference.posterior import NAMED, Verdict, healthy_nothing, read_table, verdict
 from lab.inference.recordings import SideProblem, measure_side, search_side
-from lab.inference.search import Row
 from lab.observables.flats.linearity import PHOTON_TRANSFER
 from sim.camera import Side
 from sim.memory import return_freed_memory
@@ -137,7 +136,6 @@ def diagnose_side_by_evidence(
 
 def _read(recordings: RecordingSet, side: Side, problem: SideProblem) -> SideTable:
     search, table = search_side(problem)
-    empty = replace(table, rows=(Row(frozenset(), frozenset(), 1.0, True),))
     return SideTable(
         recordings=recordings,
         side=side,
@@ -146,7 +144,7 @@ def _read(recordings: RecordingSet, side: Side, problem: SideProblem) -> SideTab
         table=table,
         posterior=read_table(table, search.hypotheses),
         checked=check_held_out(problem, search, table),
-        unchanged=check_held_out(problem, search, empty),
+        unchanged=predict_by_baseline(problem),
         least_nothing=healthy_nothing(search, DRAWS, FALSE_ALARM_RATE, np.random.default_rng(SEED)),
     )
 

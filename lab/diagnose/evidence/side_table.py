@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import chdtrc
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.formats.recording_set import RecordingSet
@@ -16,7 +17,7 @@ from lab.inference.model import State, everyday_scales, scaled_columns, with_col
 from lab.inference.posterior import Posterior
 from lab.inference.recordings import SideModel, SideProblem
 from lab.inference.search import FittedSet, Search, Table
-from lab.observables.gaussian import Gaussian
+from lab.observables.gaussian import Gaussian, chi2, conditional
 from lab.observables.observable import Observable
 from sim.camera import Side
 from sim.effects.base import Effect
@@ -28,7 +29,7 @@ class SideTable:
     """One side: what was measured, the table of sets, what it says, and the check on held-out captures.
 
     `recordings`: with metadata errors corrected. `least_nothing`: p(nothing) that 1 % of healthy draws fall short of.
-    `unchanged`: the check by the empty set alone."""
+    `unchanged`: chi2 of held-out numbers by the baseline alone."""
 
     recordings: RecordingSet
     side: Side
@@ -120,6 +121,26 @@ class SideTable:
                 sum(prior.number[k] * own * rest[k - 1] / total[k] for k in range(1, most + 1) if total[k] > 0.0)
             )
         return found
+
+
+def predict_by_baseline(problem: SideProblem) -> tuple[HeldOutCheck, ...]:
+    """Return chi2 of the held-out numbers of each observable given the used ones, by the camera without effects and
+    without small physics: its parameters alone are adapted."""
+    if not problem.held_out:
+        return ()
+    used = len(problem.measured.value)
+    gaussian = SideModel(problem.whole, ()).gaussian({}, 0.0)
+    seen = np.arange(len(problem.whole.value)) < used
+    residual, covariance = conditional(problem.whole.value - gaussian.mean, gaussian.covariance, ~seen, seen)
+    found, at = [], 0
+    for block in problem.held_out:
+        own = slice(at, at + len(block.value))
+        value = chi2(residual[own], covariance[own, own])
+        found.append(
+            HeldOutCheck(block.measurement.name, len(block.value), value, float(chdtrc(len(block.value), value)))
+        )
+        at = own.stop
+    return tuple(found)
 
 
 def _marked(model: MeasurementModel, is_held_out: Callable[[int], bool]) -> MeasurementModel:
