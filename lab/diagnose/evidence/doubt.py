@@ -45,13 +45,15 @@ def doubt_of(reading: SideTable, station: Equipment | None = None) -> Doubt | No
 
 
 def _rivals(reading: SideTable) -> Iterator[tuple[FittedSet, float]]:
+    """Yield the sets that remain, each refitted, with their probabilities."""
     held = 0.0
-    refitted = [(reading.table.fits[m], p) for m, p in reading.sets.items() if m in reading.table.fits]
-    for fit, probability in refitted[:MOST]:
+    for members, probability in list(reading.sets.items())[:MOST]:
         if probability < LEAST or held > SHARE:
             return
         held += probability
-        yield fit, probability
+        fit = reading.fit_of(members)
+        if fit is not None:
+            yield fit, probability
 
 
 def _hypothesis(reading: SideTable, fit: FittedSet, common: frozenset[str]) -> Hypothesis:

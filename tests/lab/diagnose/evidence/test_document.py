@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import lab.inference.recordings
 from evaluation.draw import recordings_of
 from evaluation.independent_simulator import LISTED, WHOLE_SESSION, ConcealedCamera, Law
 from lab.diagnose import Diagnosis, examine
+from lab.diagnose.evidence import doubt
+from lab.diagnose.evidence.causes import NOTHING
+from lab.diagnose.outcome.expected_information import entropy, expected_information
+from lab.diagnose.outcome.next_capture import WITH
 from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult
@@ -25,9 +30,11 @@ HYPOTHESES = ("row_noise", "column_noise", "excess_noise", "nonlinearity", "brig
 
 @pytest.fixture(scope="module", autouse=True)
 def few_hypotheses() -> Iterator[None]:
-    """Search a few hypotheses in the place of all."""
+    """Search a few hypotheses in the place of all, and doubt the likeliest sets however sure they are."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lab.inference.recordings, "candidates", lambda: tuple(effect(name) for name in HYPOTHESES))
+        patch.setattr(doubt, "LEAST", 1e-9)
+        patch.setattr(doubt, "SHARE", 1.0)
         yield
 
 
@@ -105,10 +112,10 @@ def test_the_improved_camera_has_the_name_and_what_stands_in_its_place(
     assert [e.name for e in camera.effects] == ["row_noise"]
     assert camera.posterior is not None
     assert "row_noise.noise_e" in camera.posterior.names
-    (doubt,) = camera.posterior.doubts
-    assert (doubt.effect, doubt.named) == ("row_noise", ("row_noise",))
-    assert doubt.rivals[0].name == ""  # nothing in its place
-    assert not doubt.rivals[0].effects
+    (name,) = camera.posterior.doubts
+    assert (name.effect, name.named) == ("row_noise", ("row_noise",))
+    assert name.rivals[0].name == ""  # nothing in its place
+    assert not name.rivals[0].effects
 
 
 def test_curves_show_used_and_held_out_captures(result: DiagnosisResult) -> None:
@@ -136,6 +143,34 @@ def test_smallest_magnitudes_are_of_what_was_searched(result: DiagnosisResult) -
         assert all(size > 0.0 for size in one.smallest.values())
         assert not effect(one.effect).shapes or not one.smallest  # its signature is no power of a size
     assert any(one.smallest for one in result.visibility)
+
+
+def test_a_doubt_is_about_what_the_likeliest_sets_differ_by(noisy: tuple[RecordingSet, Diagnosis]) -> None:
+    """Row noise is in all of them: the rivals are what acts beside it. What a capture tells is at most what is open,
+    and it settles no more than all."""
+    (open_,) = noisy[1].doubts
+    assert NOTHING in open_.rivals
+    assert all("row_noise" not in rival.split(WITH) for rival in open_.rivals)
+    assert sum(open_.odds) == pytest.approx(1.0)
+    assert open_.captures
+    for capture in open_.captures:
+        assert 0.0 <= expected_information([capture.forecast], open_.odds) <= entropy(open_.odds) + 1e-9
+        assert np.all(np.isfinite(capture.forecast.mean))
+    for offered in noisy[1].result.next_captures:
+        assert offered.settles is not None
+        assert max(open_.odds) >= NAMED or offered.settles <= 1.0
+
+
+def test_the_same_captures_again_tell_no_two_sets_apart_that_fit_them_alike(
+    noisy: tuple[RecordingSet, Diagnosis],
+) -> None:
+    """Sets of which the recordings say so little that both keep their prior odds have the same predictions within the
+    noise of these recordings: below 5 standard deviations."""
+    (open_,) = noisy[1].doubts
+    again = [c for c in open_.captures if "again" in c.words]
+    assert again
+    for capture in again:
+        assert float(np.sqrt(2.0 * capture.forecast.distances().max())) < 5.0, capture.words
 
 
 def test_a_camera_without_effects_has_no_mismatch(few_hypotheses: None) -> None:
