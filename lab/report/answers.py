@@ -37,7 +37,7 @@ PROOFS = 2  # charts
 ODDS = 4  # sets of effects a side
 #: Most effects that the first screen describes; the others follow in the diagnosis.
 NAMED = 4
-#: From this probability on, physics of no list is told on the first screen.
+#: From this probability on, unlisted physics is told on the first screen.
 LIKELIER = 0.5
 #: Prefixes of the names of the key figures on the first screen.
 STRIP = ("system gain", "temporal dark noise", "saturation capacity", "dark current", "DSNU", "PRNU")
@@ -124,7 +124,7 @@ def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
     for state in diagnosis.unlisted:
         if state.probability >= LIKELIER:
             yield (
-                f"Physics of no list acts on the {state.state} of the {state.side} camera: probability "
+                f"Unlisted physics acts on the {state.state} of the {state.side} camera: probability "
                 f"{state.probability:.2f}."
             )
     if diagnosis.unexplained:

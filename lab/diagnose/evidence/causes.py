@@ -150,7 +150,7 @@ def _holds_absence(u: FloatArray) -> bool:
 
 
 def _inexact(reading: SideTable, names: frozenset[str]) -> float:
-    """Return p(a form error above the declared tolerance, or physics of no list, given that one of these acts).
+    """Return p(a form error above the declared tolerance, or unlisted physics, given that one of these acts).
     Unlisted groups count where most of what they change lies in measurements that the effect changes."""
     total = inexact = 0.0
     groups = {name: _shared_groups(reading, name) for name in names}

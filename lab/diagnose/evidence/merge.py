@@ -296,7 +296,7 @@ def _summary(
         if state.probability >= LIKELIER:
             places = " and ".join(measurement_title(name) for name in state.measurements)
             yield (
-                f"Physics of no list acts on the {state.state} of the {state.side} camera, with probability "
+                f"Unlisted physics acts on the {state.state} of the {state.side} camera, with probability "
                 f"{state.probability:.3f}; it shows in {places}."
             )
     for item in lists.unexplained:

@@ -153,7 +153,7 @@ def _captures(block: Observable) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _UnlistedChange:
-    """Physics of no list, under the likeliest set that holds it: what it changes of the used numbers (n,), without and
+    """Unlisted physics, under the likeliest set that holds it: what it changes of the used numbers (n,), without and
     with it."""
 
     change: FloatArray
@@ -176,7 +176,7 @@ def _unlisted_change(reading: SideTable, group: int) -> _UnlistedChange | None:
 
 
 def unlisted_of(reading: SideTable) -> tuple[list[Unlisted], list[Unexplained]]:
-    """Return the states on which physics of no list may act; and those on which it acts more likely than not, as
+    """Return the states on which unlisted physics may act; and those on which it acts more likely than not, as
     mismatches without a name."""
     listed, left = [], []
     for finding in reading.posterior.findings:
@@ -234,7 +234,7 @@ def _without_name(
     parts = [s for s in examine_places(reading.used, departure.before) if s.block is block]
     return Unexplained(
         side=reading.side, measurement=block.measurement.name, axis=block.measurement.axis, where=where,
-        shape=f"physics of no list acts on the {declared.name}, with probability {probability:.3f}",
+        shape=f"unlisted physics acts on the {declared.name}, with probability {probability:.3f}",
         significance_sigma=round(parts[0].significance_sigma, 2), chi2_before=before, chi2_after=after, n=len(of),
         captures=_captures(block),
     )  # fmt: skip

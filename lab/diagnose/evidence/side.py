@@ -67,14 +67,21 @@ Refit = Callable[[RecordingSet], FitResult]
 class EvidenceFindings:
     """The findings on one side.
 
-    lists         what the result lists of this side
-    said          the side's verdict by itself
-    causes        effects and families that are probable enough to be described, likeliest first
-    inclusion     inclusion probability of every effect and family, before and after the recordings: name -> (prior,
-    posterior) groups  names of the states that physics of no list may act on
-    improved      the improved model
-    doubt         sets that are left, and the captures that would separate them
-    settling      what to capture for a mismatch without a name, as a sentence
+    lists : what the result lists of this side
+    is_judged : whether any measurement is determined
+    gain_is_known : whether a conversion gain is stated or measured; else electrons are those of 1 DN/e
+    said : the side's verdict by itself
+    check_passed : whether no observable of the held-out captures contradicts the prediction
+    nothing, least_nothing : probability that no effect and nothing unlisted acts, and the value that
+        `FALSE_ALARM_RATE` of the cameras without any fall short of
+    calm : whether every state is less likely than not to have unlisted physics
+    is_undecided : whether more than 1 % of the probability belongs to sets that had to be refitted and never were
+    causes : effects and families that are probable enough to be described, likeliest first
+    inclusion : prior and posterior inclusion probability of every effect and family, by name
+    metadata : statements that the recordings contradict
+    improved : the improved model
+    doubt : the sets that remain, and the captures that would separate them
+    settling : what to capture for a mismatch without a name, as a sentence
     """
 
     side: Side

@@ -172,7 +172,7 @@ class DiscoveredLaw(Frozen):
 
 
 class Unlisted(Frozen):
-    """Physics that no list has, acting on one state of the chain of light, with its posterior probability.
+    """Unlisted physics that acts on one state of the chain of light, with its posterior probability.
 
     `measurements`: those that show it, strongest first. `where`: the part of the first of them that shows it."""
 
@@ -238,7 +238,7 @@ class ResidualCurve(Frozen):
 class EffectSet(Frozen):
     """A set of effects that may act together, with its posterior probability; the empty set is the baseline.
     `refitted`: its parameters were fitted; otherwise the probability is of the linear problem about a likely set.
-    `unlisted`: states of the chain of light on which physics of no list acts beside them."""
+    `unlisted`: states of the chain of light on which unlisted physics acts beside them."""
 
     effects: tuple[str, ...]
     probability: float

@@ -606,7 +606,7 @@ def test_a_table_of_sets_is_shown_with_what_is_unlisted(
     assert "If every cause is a listed effect" not in text
     assert "Posterior probabilities; unlisted physics is among them." in text
     assert "optical low-pass filter + unlisted physics of the transfer, none further" in text
-    assert "Physics of no list acts on the transfer of the left camera: probability 0.61." in text
+    assert "Unlisted physics acts on the transfer of the left camera: probability 0.61." in text
     assert "Left: 0.4 % of the probability belongs to sets that were not refitted." in text
     assert "2 (0 to 5.5) µm, not determined" in text
     ((_, rows),) = odds(by_table)
