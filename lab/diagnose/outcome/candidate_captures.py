@@ -3,8 +3,8 @@ covariance."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import constants
@@ -64,7 +64,8 @@ class Hypothesis:
 
     `displaced`: the same effects with the rival's parameters one posterior standard deviation away, a set for each
     principal direction of these; `beside`: those that act beside the rival; `law_std`: relative standard deviation of
-    what its law changes.
+    what its law changes. `law_stds`: by the name of an effect, relative standard deviation of what its law changes
+    beside the others.
     """
 
     name: str
@@ -73,6 +74,15 @@ class Hypothesis:
     displaced: tuple[tuple[Effect, ...], ...] = ()
     beside: tuple[Effect, ...] | None = None
     law_std: float = 0.0
+    law_stds: Mapping[str, float] = field(default_factory=dict)
+
+    def without(self) -> Iterator[tuple[tuple[Effect, ...], float]]:
+        """Yield the effects without one whose law may be wrong, and the relative standard deviation of its change."""
+        if self.beside is not None and self.law_std > 0.0:
+            yield self.beside, self.law_std
+        for name, std in self.law_stds.items():
+            if std > 0.0:
+                yield tuple(e for e in self.effects if e.name != name), std
 
 
 @dataclass(frozen=True)
@@ -92,8 +102,8 @@ class CandidateCapture:
         for h, own in zip(rivals, mean, strict=True):
             moved = [self.predict(replace(h, effects=effects)) - own for effects in h.displaced]
             jacobian.append(np.reshape(moved, (len(moved), -1)).T if moved else np.zeros((len(own), 0)))
-            without = None if h.beside is None or h.law_std == 0.0 else self.predict(replace(h, effects=h.beside))
-            law_error.append(np.zeros((len(own), 0)) if without is None else h.law_std * (own - without)[:, None])
+            wrong = [std * (own - self.predict(replace(h, effects=effects))) for effects, std in h.without()]
+            law_error.append(np.reshape(wrong, (len(wrong), -1)).T if wrong else np.zeros((len(own), 0)))
         return Forecast.of(mean, jacobian, law_error, self.covariance)
 
 

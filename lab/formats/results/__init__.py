@@ -29,6 +29,7 @@ from lab.formats.results.diagnosis import (
     RivalOdds,
     SideModels,
     Unexplained,
+    Unlisted,
     VetoedName,
     Visibility,
 )
@@ -159,6 +160,7 @@ __all__ = [
     "StandardsResult",
     "StereoFit",
     "Unexplained",
+    "Unlisted",
     "ValidationResult",
     "VetoedName",
     "ViewResiduals",
