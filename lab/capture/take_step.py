@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from bluesky.utils import Msg
 
-from lab.capture.devices import LightSetting, PhotodiodeDevice, Shot, ShownPattern
+from lab.capture.devices import LampDevice, LightSetting, PhotodiodeDevice, Shot, ShownPattern
 from lab.capture.instruments import Instruments
 from lab.capture.records import StoredFile
 from lab.capture_kinds.base import Capture, FindExposure, FixedExposure, Reading, RelativeExposure, Step
@@ -60,17 +60,29 @@ def arrange(step: Step, instruments: Instruments) -> Plan[None]:
             moves.append((instruments.shutter, False))
         else:
             moves.append((light, LightSetting(setting.wavelength_nm, setting.slit_um)))
+    lamp = _lamp_of(step, instruments)
+    if lamp is not None and not (setting.lamp and lamp.value == setting.lamp):
+        moves.append((lamp, setting.lamp))
     if instruments.screen is not None:
         moves.append((instruments.screen, ShownPattern(setting.pattern, setting.cell_px if setting.pattern else 1)))
     moves = [(device, value) for device, value in moves if device.value != value]
     for device, value in moves:
         yield Msg("set", device, value, group="arrange")
+    if lamp is not None and setting.lamp and lamp.value == setting.lamp:
+        yield Msg("set", lamp, setting.lamp, group="arrange")  # it reads back that nobody has switched it off
     yield Msg("wait", None, group="arrange")
     # Last: before the grating has arrived, the light has another wavelength.
     opens = instruments.shutter is not None and setting.wavelength_nm is not None and not instruments.shutter.value
     if opens:
         yield from _set_shutter(instruments, True)
     cameras.in_series = cameras.in_series and not moves and not opens
+
+
+def _lamp_of(step: Step, instruments: Instruments) -> LampDevice | None:
+    """Return the light source. Raises InputError where a step needs one and there is none."""
+    if step.setting.lamp and instruments.lamp is None:
+        raise InputError(f"station: step {step.id!r} needs a [light_source]; add it to the station file")
+    return instruments.lamp
 
 
 def adjust(name: str, instruments: Instruments) -> Plan[None]:
@@ -173,7 +185,6 @@ def take(
     If the spectroradiometer refuses to measure the light (too dark, too bright), a step with captures is skipped, with
     the reason in its result; in a step without captures this raises DeviceError, as later steps need the spectrum.
     Raises InputError for a missing instrument."""
-    wavelength_nm = step.setting.wavelength_nm or 0.0
     photodiode = _irradiance_meter(step, instruments)
     if photodiode is not None and photodiode.dark_a is None:
         yield from _dark_current(instruments)
@@ -195,7 +206,7 @@ def take(
         files.append(radiometer.stored)
         result["radiance"] = step.radiance
     if photodiode is not None:
-        yield from _measure_irradiance(photodiode, wavelength_nm)
+        yield from _measure_irradiance(photodiode, irradiance_nm(step))
     captures: tuple[Capture, ...] = ()
     gain_db = instruments.limits.gain_db if step.setting.gain_db is None else step.setting.gain_db
     if isinstance(step.exposure, FindExposure):
@@ -245,8 +256,11 @@ def _measure_irradiance(photodiode: PhotodiodeDevice, wavelength_nm: float | Non
 
 
 def _dark_current(instruments: Instruments) -> Plan[None]:
-    """Close the shutter and measure the photodiode's dark current."""
+    """Close the shutter, darken the light source, and measure the photodiode's dark current."""
     assert instruments.photodiode is not None
+    if instruments.lamp is not None and instruments.lamp.value != {}:
+        yield Msg("set", instruments.lamp, {}, group="lamp")
+        yield Msg("wait", None, group="lamp")
     if instruments.shutter is not None and instruments.shutter.value is not False:
         yield from _set_shutter(instruments, False)
     yield from _measure_irradiance(instruments.photodiode, None)
@@ -289,6 +303,7 @@ def _completed(step: Step, instruments: Instruments, dummies: int) -> tuple[Capt
             "temperature_c": frame.temperature_c,
             "time": frame.time,
             "dummy_frames": dummies or None,
+            "lamp_levels": dict(instruments.lamp.levels) if instruments.lamp and step.setting.lamp else None,
         }
         for key, field in type(capture).model_fields.items():
             for mark in field.metadata:
