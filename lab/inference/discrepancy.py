@@ -106,7 +106,7 @@ ON_OBSERVABLES = (
     ),
     GroupDeclaration(
         "gain by line", 0.00005, "1, of the observable's scale", "healthy sets of two simulators",
-        observables=("green_balance", "flat_lines", "row_periods", "line_gains"),
+        observables=("green_balance", "flat_lines", "row_periods", "line_gains", "flat_pattern"),
     ),
     GroupDeclaration(
         "screens", 0.001, "1, of the observable's scale", "screens drawn to 1/55 px; drawn to 1/25 px they leave 0.7 %",
