@@ -46,6 +46,8 @@ LEAST_ANGLE_DEG, MOST_ANGLE_DEG = 2.0, 10.0
 LEAST_DARK_SHARE, MOST_DARK_SHARE = 0.10, 0.40
 LEAST_LINES = 60
 MAP_ROWS, MAP_COLS = 5, 7
+#: Of the edge's positions in the lines about their curve, rms.
+MOST_SCATTER_PX = 1.0
 
 
 @dataclass(frozen=True)
@@ -106,9 +108,10 @@ def measure_e_sfr(
     lines, n = values.shape
     place = np.arange(lines)
     edge = _edge_positions(values, window, order)
-    if np.any((edge < 1.0) | (edge > n - 2.0)):
+    line = np.polynomial.polynomial.Polynomial.fit(place, edge, 1)
+    if any(np.any((one < 1.0) | (one > n - 2.0)) for one in (edge, line(place))):
         raise NotDetermined("e-SFR", "the edge leaves the region: widen the region, or shorten it along the edge")
-    tilt = float(np.polyfit(place, edge, 1)[0])
+    tilt = float(line.deriv()(0.0))
     cosine = float(np.cos(np.arctan(tilt)))
     bins = np.floor(BINS_PER_PX * (np.arange(n)[None, :] - edge[:, None] + n / 2.0)).astype(int)
     size = BINS_PER_PX * n
@@ -170,6 +173,13 @@ def _edge_positions(values: FloatArray, window: Window, order: int) -> FloatArra
             raise NotDetermined("e-SFR", "a line of the region has no edge: narrow the region to the edge")
         degree = min(order if number else 1, max(lines // 20, 1))
         centre = np.polynomial.polynomial.Polynomial.fit(place, found, degree, domain=[-1.0, 1.0])(place)
+    scatter = float(np.sqrt(np.mean((found - centre) ** 2)))
+    if scatter > MOST_SCATTER_PX:
+        raise NotDetermined(
+            "e-SFR",
+            f"the positions of the edge scatter by {scatter:.1f} px about the fitted curve; of one edge they do by "
+            f"{MOST_SCATTER_PX:g} px at most: narrow the region, or turn the edge to 5 degrees",
+        )
     return np.asarray(centre)
 
 
@@ -398,9 +408,8 @@ class Iso12233(Standard):
         )
 
     def remarks(self) -> Iterator[str]:
-        hamming = self.edge.e_sfr("hamming", 1)
         try:
-            value, std = hamming.falls_to(0.5)
+            value, std = self.edge.e_sfr("hamming", 1).falls_to(0.5)
         except NotDetermined:
             return
         pitch = self.edge.pitch_px
