@@ -23,7 +23,7 @@ from lab.inference.search import Table
 from sim.camera import Side
 
 #: Draws behind the threshold of `no_mismatch`, and the share of healthy cameras below it.
-DRAWS, RATE = 100, 0.01
+DRAWS, RATE = 400, 0.01
 #: Frames of the independent simulator, px.
 ROWS, COLS = 192, 256
 #: Statements that are listed: at least this probable.

@@ -6,6 +6,7 @@ import contextlib
 import importlib.util
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,8 +16,9 @@ from rich.markup import escape
 from lab.capture.data_folder import open_store, store_to_read
 from lab.cli.bench_process import mock_bench
 from lab.cli.console import check_writable, err, make_folder, out, write_json
-from lab.cli.sources import Json, StoreFolder, recordings_of, run_here
+from lab.cli.sources import EngineName, Json, StoreFolder, recordings_of, run_here
 from lab.cli.tables import print_fit, print_resolving, print_sequences
+from lab.engine import DEFAULT_ENGINE
 from lab.errors import InputError
 from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult, capture_here, session_recordings
 
@@ -128,6 +130,7 @@ def run(
     ] = "",
     only: Only = None,
     parameters: Set = None,
+    engine: EngineName = DEFAULT_ENGINE,
     conceal: Conceal = None,
     standards: Annotated[
         bool,
@@ -177,7 +180,9 @@ def run(
             name=name,
         )
         request = PipelineRequest("pipeline", capture=session, resolve=limits)
+    request = replace(request, engine=engine)
     verb = ["run"]  # what goes on then fits and diagnoses, too
+    verb += [] if engine == DEFAULT_ENGINE else [f"--engine={engine}"]
     verb += ["--resolve"] if resolve else []
     verb += [] if resolve_minutes is None else [f"--resolve-minutes={resolve_minutes:g}"]
     verb += [] if resolve_rounds is None else [f"--resolve-rounds={resolve_rounds}"]

@@ -19,6 +19,7 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.side_model import dataset_of, measurement_model
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.metadata import misstatements, unchecked
+from lab.diagnose.outcome.determined import combinations
 from lab.diagnose.outcome.goodness_of_fit import (
     detectability,
     held_out,
@@ -49,7 +50,7 @@ from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import DiagnosisLists, FitResult, HeldOut, Mismatch, Skipped
+from lab.formats.results import Combination, DiagnosisLists, FitResult, HeldOut, Mismatch, Skipped
 from lab.observables.dataset import Dataset
 from lab.observables.flats.linearity import PHOTON_TRANSFER
 from lab.workers import Workers
@@ -70,6 +71,7 @@ class NamedCandidate:
     candidate: Candidate
     shown_in: tuple[str, ...]  # measurements in which its change exceeds the noise
     corrections: tuple[str, ...] = ()  # corrections of the improved model beside a family's nearest law, in words
+    combinations: tuple[Combination, ...] = ()  # determined, of parameters that aren't by themselves
 
 
 @dataclass(frozen=True)
@@ -212,7 +214,12 @@ def diagnose_side(
         gain_is_known=model.gain_is_known,
         threshold=verdict.threshold if np.isfinite(verdict.threshold) else None,
         named=tuple(
-            NamedCandidate(c, shown_in(verdict, c, policy), family_corrections(verdict, c, corrections, policy))
+            NamedCandidate(
+                c,
+                shown_in(verdict, c, policy),
+                family_corrections(verdict, c, corrections, policy),
+                combinations(side, model, verdict.effects, c.effect),
+            )
             for c in verdict.named
         ),
         abstained=verdict.abstained,

@@ -193,9 +193,10 @@ class SetPrior:
         return frozenset(sets[int(rng.choice(len(sets), p=weight / weight.sum()))])
 
 
-def symmetric(weights: Sequence[float], most: int) -> FloatArray:
-    """Return the elementary symmetric polynomials of degree 0 to `most`: sums over all sets of k of their products."""
-    total = np.zeros(most + 1)
+def symmetric(weights: Sequence[float] | Sequence[FloatArray], most: int) -> FloatArray:
+    """Return the elementary symmetric polynomials of degree 0 to `most`: sums over all sets of k of their products.
+    Weights are numbers, or arrays of one shape, for each element by itself."""
+    total = np.zeros((most + 1, *(np.shape(weights[0]) if len(weights) else ())))
     total[0] = 1.0
     for w in weights:
         total[1:] += w * total[:-1]

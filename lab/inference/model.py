@@ -84,9 +84,13 @@ class Group:
         the prior."""
         share = (np.arange(SCALES) + 0.5) / SCALES
         if not unlisted:
-            return np.asarray(self.everyday * _half_normal_quantile(share))
+            return self.everyday_quantile(share)
         low, high = np.log(3.0 * self.everyday), np.log(self.largest)
         return np.exp(low + share * (high - low))
+
+    def everyday_quantile(self, share: FloatArray) -> FloatArray:
+        """Return the quantiles of the everyday prior of tau."""
+        return np.asarray(self.everyday * _half_normal_quantile(share))
 
 
 #: Points of tau for every group.
@@ -162,11 +166,22 @@ class ScaleIntegral:
         table, r = white[:, :-1], white[:, -1]
         projected = table.T @ r
         projected[len(projected) - len(pull) :] += pull
-        one = 1.0 - (1.0 - any_unlisted) ** (1.0 / max(len(groups), 1))
         return cls(
             table.T @ table, projected, tuple(g.columns.shape[1] for g in groups), precision, tuple(groups),
-            (float(np.log1p(-one)), float(np.log(one))),
+            cls.log_priors(len(groups), any_unlisted),
         )  # fmt: skip
+
+    @staticmethod
+    def log_priors(groups: int, any_unlisted: float) -> tuple[float, float]:
+        """Return the log prior of u_g = 0 and of u_g = 1 of each of so many groups."""
+        one = 1.0 - (1.0 - any_unlisted) ** (1.0 / max(groups, 1))
+        return float(np.log1p(-one)), float(np.log(one))
+
+    def log_det(self, tau: FloatArray) -> float:
+        """1/2 log det of 1 + amplitude M amplitude of the groups alone at these scales (G,)."""
+        amplitude = np.repeat(tau, self.group_sizes)
+        inner = np.eye(len(amplitude)) + amplitude[:, None] * self.gram[: len(amplitude), : len(amplitude)] * amplitude
+        return float(np.log(np.diag(np.linalg.cholesky(inner))).sum())
 
     def log_likelihood(self, tau: FloatArray) -> float:
         """Log marginal likelihood at these scales (G,), up to a constant of the set."""

@@ -15,6 +15,18 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import least_squares
 
+from lab.inference.closed_form import (
+    SILENT,
+    HealthyDraws,
+    Signature,
+    gains_of,
+    integrate_set,
+    log_mean_exp,
+    others_over_empty,
+    project_groups,
+    signature_log_odds,
+    signatures_of,
+)
 from lab.inference.hypotheses import (
     DEGREES,
     Coordinate,
@@ -46,13 +58,13 @@ REFITS = 60
 LEFT = 0.01
 #: Log odds below the likeliest set at which the closed form is trusted to rule a set out, however large its error.
 HOPELESS = 50.0
+#: Gain of log evidence above which an estimate is made again about the largest refitted part of its set: of large
+#: changes the closed form is wrong by a share of the gain.
+HALFWAY = 5.0
 #: The most hypotheses that are tried beside the likeliest set where the best gains more than `HOPELESS`.
 SINGLES = 8
 #: Refits of sets that the closed form about a set far below the likeliest promises: about such a set it isn't linear.
 DOUBTFUL = 3
-#: Gain of log evidence up to which the recordings say little of a set beyond its nearest refitted subset: the closed
-#: form is as good as a refit there.
-SILENT = 1.0
 #: P(any group is unlisted) of a camera.
 ANY_UNLISTED = 0.05
 #: Log odds below the likeliest set beyond which a set isn't made an origin of closed forms, and its scales aren't
@@ -66,6 +78,8 @@ PAIRS, TRIPLES, EXTENSIONS = 120, 12, 10
 NEAR = 3.0
 #: Scales of the groups, drawn from their posterior, over which a closed form is averaged.
 SCALES_AVERAGED = 7
+#: Share of healthy draws whose p(nothing) is taken as that of a measured set, the lowest.
+REFINED = 0.03
 #: Gain of log evidence up to which a size may be near 0, where shapes vanish.
 WEAK = 6.0
 #: Log evidence within which two alternatives of one hypothesis are both refitted, and the most that are.
@@ -198,31 +212,10 @@ class Table:
 
 
 @dataclass(frozen=True)
-class _Signature:
-    """An alternative's changes of the prediction (n, k), beside no other hypothesis."""
-
-    owner: str
-    index: int  # of the alternative
-    raw: FloatArray
-    coordinates: tuple[Coordinate, ...]  # of the coefficients
-    columns: tuple[int, ...]  # in the stacked table
-    points: tuple[tuple[int, int | None], ...]  # of each column, the alternative's points of positive and negative sign
-
-    def of_points(self, c: FloatArray, count: int) -> FloatArray:
-        """Return the coefficients (>= 0) of all points of the alternative, given those of the columns."""
-        found = np.zeros(count)
-        for (plus, minus), one in zip(self.points, c, strict=True):
-            if one >= 0.0 or minus is None:
-                found[plus] = max(one, 0.0)
-            else:
-                found[minus] = -one
-        return found
-
-
-@dataclass(frozen=True)
 class _Estimate:
     log_posterior: float
     gain: float  # of log evidence over the origin
+    weight: float  # log p(y | A, u) p(u) p(A) of the origin with the unlisted groups of the estimate
     origin: frozenset[str]
     alternatives: tuple[int, ...]  # signatures, by index
     coefficients: tuple[FloatArray, ...]
@@ -324,20 +317,32 @@ class Search:
     def _next(self) -> frozenset[str] | None:
         """Return the likeliest set that was never refitted; None where these hold less than `LEFT` together."""
         top = self._top()
-        speaking = {k: e for k, e in self.estimates.items() if k not in self.fits and e.gain > SILENT}
-        near = {k: e.log_posterior for k, e in speaking.items() if self._is_near(e)}
-        everything = [*near.values(), *(self._log_posterior(f) for f in self.fits.values())]
-        if near and log_sum_exp(list(near.values())) > log_sum_exp(everything) + np.log(0.5 * LEFT):
-            return self._first_part(max(near, key=lambda key: near[key]))
+        while True:
+            speaking = {k: e for k, e in self.estimates.items() if k not in self.fits and e.gain > SILENT}
+            near = {k: e.log_posterior for k, e in speaking.items() if self._is_near(e)}
+            everything = [*near.values(), *(self._log_posterior(f) for f in self.fits.values())]
+            if not near or log_sum_exp(list(near.values())) < log_sum_exp(everything) + np.log(0.5 * LEFT):
+                break
+            key = self._first_part(max(near, key=lambda key: near[key]))
+            nearer = self._nearest_fit(key)
+            if nearer.members in self.singles or self.estimates[key].gain < HALFWAY:
+                return key
+            self._linearise(nearer)
         far = {k: e.log_posterior for k, e in speaking.items() if k not in near and e.log_posterior > top - HOPELESS}
         if far and self._doubtful < DOUBTFUL:
             self._doubtful += 1
             return self._first_part(max(far, key=lambda key: far[key]))
         return None
 
+    def _nearest_fit(self, members: frozenset[str]) -> FittedSet:
+        """Return the largest refitted part of a set, of several the likeliest."""
+        parts = [f for f in self.fits.values() if f.members < members]
+        return max(parts, key=lambda f: (len(f.members), self._log_posterior(f)))
+
     def _is_near(self, estimate: _Estimate) -> bool:
-        """Whether an estimate's origin is near enough the likeliest set for its closed form to be believed."""
-        return self._log_posterior(self.fits[estimate.origin]) > self._top() - HOPELESS
+        """Whether an estimate's origin, with the same groups unlisted, is near enough the likeliest set for its closed
+        form to be believed."""
+        return estimate.weight > self._top() - HOPELESS
 
     def _first_part(self, key: frozenset[str]) -> frozenset[str]:
         """Return the part of a set that is refitted before it: one whose gain over the same origin is at least half of
@@ -518,25 +523,8 @@ class Search:
     # --- closed form about a fitted set ------------------------------------------------------------------------------
 
     @cached_property
-    def _signatures(self) -> tuple[_Signature, ...]:
-        base = self.model.mean({})
-        found: list[_Signature] = []
-        at = 0
-        for name, hypothesis in self.hypotheses.items():
-            for index, alternative in enumerate(hypothesis.alternatives):
-                raw = np.column_stack([self.model.mean({name: p}) - base for p in alternative.points])
-                if not raw.any():
-                    continue
-                points = _merged(raw, alternative.scales)
-                raw = raw[:, [plus for plus, _ in points]]
-                coords = tuple(
-                    Coordinate("c", alternative.scales[plus], lower=0.0 if minus is None else -np.inf)
-                    for plus, minus in points
-                )
-                columns = tuple(range(at, at + raw.shape[1]))
-                found.append(_Signature(name, index, raw, coords, columns, points))
-                at += raw.shape[1]
-        return tuple(found)
+    def _signatures(self) -> tuple[Signature, ...]:
+        return signatures_of(self.model, self.hypotheses)
 
     @cached_property
     def _stack(self) -> FloatArray:
@@ -557,15 +545,11 @@ class Search:
 
     def _linear(self, gram: FloatArray, tau: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return z and R of the signatures with the groups at these scales (G,) marginalised, given `_gram`."""
-        amplitude = np.repeat(tau, [g.columns.shape[1] for g in self.model.groups])
-        at = len(amplitude)
-        inner = np.eye(at) + amplitude[:, None] * gram[:at, :at] * amplitude
-        across = amplitude[:, None] * gram[:at, at:]
-        left = gram[at:, at:] - across.T @ np.linalg.solve(inner, across)
+        left = project_groups(gram, np.repeat(tau, [g.columns.shape[1] for g in self.model.groups]))
         return left[:-1, -1], left[:-1, :-1]
 
     def _averaged_over_scales(
-        self, origin: FittedSet, unlisted: frozenset[int], gram: FloatArray, single: Iterable[int]
+        self, scales: ScaleIntegral, unlisted: frozenset[int], gram: FloatArray, single: Iterable[int]
     ) -> dict[int, float]:
         """Return the log evidence ratios of single signatures over a fitted set, with the groups' scales integrated:
 
@@ -573,17 +557,13 @@ class Search:
 
         A hypothesis leaves less to the groups than the set without it, so that the ratio at that set's likeliest scales
         is too small."""
-        ratios: dict[int, list[float]] = {i: [] for i in single}
-        for tau in origin.likeliest.scales.stratified(unlisted, SCALES_AVERAGED):
+        which = list(single)
+        signatures = [self._signatures[i] for i in which]
+        ratios = []
+        for tau in scales.stratified(unlisted, SCALES_AVERAGED):
             z, square = self._linear(gram, tau)
-            for i, values in ratios.items():
-                signature = self._signatures[i]
-                if len(signature.columns) == 1:
-                    (k,), (c,) = signature.columns, signature.coordinates
-                    values.append(_amplitude_log_odds(float(z[k]), float(square[k, k]), c))
-                else:
-                    values.append(_set_integral(z, square, [signature])[0])
-        return {i: log_sum_exp(values) - float(np.log(len(values))) for i, values in ratios.items()}
+            ratios.append(signature_log_odds(z, square, signatures))
+        return dict(zip(which, log_mean_exp(np.array(ratios)).tolist(), strict=True)) if which else {}
 
     def _near_alternatives(self, origin: FittedSet, owner: str, chosen: int) -> list[tuple[int, FloatArray]]:
         """Return other alternatives of a hypothesis that are nearly as likely as the one chosen."""
@@ -621,9 +601,9 @@ class Search:
         owners: dict[str, list[int]] = {}
         for i, s in enumerate(signatures):
             if s.owner not in origin.state:
-                single[i] = _set_integral(z, gram, [s])
+                single[i] = integrate_set(z, gram, [s])
                 owners.setdefault(s.owner, []).append(i)
-        ratio = self._averaged_over_scales(origin, unlisted, whole, single)
+        ratio = self._averaged_over_scales(origin.likeliest.scales, unlisted, whole, single)
         gains = {o: log_sum_exp([ratio[i] for i in own]) - float(np.log(len(own))) for o, own in owners.items()}
         if not unlisted:
             for o, own in owners.items():
@@ -652,16 +632,16 @@ class Search:
         """Note a set's log posterior with `weight` the log p(y | A, u) p(u) of its origin. The estimate about the
         largest origin counts, of several the likeliest; those of one origin by other groups are summed."""
         key = origin.members | more
-        value = weight + gain + self.prior.log(key)
+        value, at = weight + gain + self.prior.log(key), weight + self.prior.log(origin.members)
         known = self.estimates.get(key)
         if not np.isfinite(value):
             return
         if known is not None and known.origin == origin.members:
             total = float(np.logaddexp(value, known.log_posterior))
-            first = known if known.log_posterior > value else _Estimate(total, gain, origin.members, which, c)
+            first = known if known.log_posterior > value else _Estimate(total, gain, at, origin.members, which, c)
             self.estimates[key] = replace(first, log_posterior=total)
         elif known is None or self._is_nearer(origin, known):
-            self.estimates[key] = _Estimate(value, gain, origin.members, which, c)
+            self.estimates[key] = _Estimate(value, gain, at, origin.members, which, c)
 
     def _is_nearer(self, origin: FittedSet, known: _Estimate) -> bool:
         other = self.fits[known.origin]
@@ -705,7 +685,7 @@ class Search:
         for rank, (gain, name, other, one, two_) in enumerate(tried):
             value, c = gain, (single[one][1], single[two_][1])
             if rank < PAIRS:
-                integral, both = _set_integral(z, gram, [signatures[one], signatures[two_]])
+                integral, both = integrate_set(z, gram, [signatures[one], signatures[two_]])
                 value = integral + shared[name] + shared[other]
                 cut = len(signatures[one].coordinates)
                 c = (both[:cut], both[cut:])
@@ -727,14 +707,14 @@ class Search:
             promising = sorted((o for o in best if o not in (name, other)), key=lambda o: -left[best[o]])[:EXTENSIONS]
             for third in promising:
                 three = [signatures[i] for i in (one, two, best[third])]
-                value, c = _set_integral(z, gram, three)
+                value, c = integrate_set(z, gram, three)
                 cuts = np.cumsum([len(s.coordinates) for s in three])[:-1]
                 value += sum(shared[o] for o in (name, other, third))
                 self._estimate(
                     origin, weight, {name, other, third}, value, (one, two, best[third]), tuple(np.split(c, cuts))
                 )  # fmt: skip
 
-    def _left(self, z: FloatArray, gram: FloatArray, members: Sequence[_Signature]) -> FloatArray:
+    def _left(self, z: FloatArray, gram: FloatArray, members: Sequence[Signature]) -> FloatArray:
         """Return what one column of each signature by itself takes of the residual that `members` leave."""
         own = [k for s in members for k in s.columns]
         inner = gram[np.ix_(own, own)] + 1e-8 * np.diag(np.diag(gram)[own] + 1e-300)
@@ -746,40 +726,21 @@ class Search:
         return np.array([taken[list(s.columns)].max() for s in self._signatures])
 
     def healthy_draws(self, draws: int, rng: np.random.Generator) -> FloatArray:
-        """Return p(no effect, nothing unlisted) of draws without either, (draws,), by single effects and flips."""
-        groups = self.model.groups
-        gaussian = self.model.gaussian({}, 0.0)
-        sizes = [g.columns.shape[1] for g in groups]
-        white = gaussian.whiten(np.concatenate([*(g.columns for g in groups), self._stack], axis=1))
-        gram, at, none = white.T @ white, sum(sizes), np.zeros(0)
-        empty = np.zeros((len(white), 0))
-        scales = ScaleIntegral.of(gaussian, np.zeros(len(white)), groups, empty, none, none, self.any_unlisted)
-        found = []
-        for _ in range(draws):
-            tau = np.array([g.everyday * abs(rng.standard_normal()) for g in groups])
-            r = rng.standard_normal(len(white)) + white[:, :at] @ (np.repeat(tau, sizes) * rng.standard_normal(at))
-            projected = white.T @ r
-            one = replace(scales, projected=projected[:at], _known={})
-            found.append(self._nothing(one, gram, projected, at))
-        return np.array(found)
+        """Return p(no effect, nothing unlisted) of draws without either, (draws,), lowest first: by the closed form
+        about the empty set, those that are lowest by a rougher one (`HealthyDraws.screen`)."""
+        drawn = HealthyDraws.of(self.model, self._signatures, self.any_unlisted, draws, rng)
+        found = drawn.screen(self.hypotheses, self._signatures, self.prior, rng)
+        for d in np.argsort(found)[: max(int(np.ceil(REFINED * draws)), 1)]:
+            found[d] = self._nothing(*drawn.one(int(d)))
+        return np.sort(found)
 
-    def _nothing(self, scales: ScaleIntegral, gram: FloatArray, projected: FloatArray, at: int) -> float:
-        """Return p(nothing) of one draw, of which `gram` and `projected` are M and W'r, groups first."""
-        none: frozenset[int] = frozenset()
-        amplitude = np.repeat(scales.everyday_mode, scales.group_sizes)
-        inner = np.eye(at) + amplitude[:, None] * gram[:at, :at] * amplitude
-        across = amplitude[:, None] * gram[:at, at:]
-        solved = np.linalg.solve(inner, np.column_stack([across, amplitude * projected[:at]]))
-        square = np.diag(gram)[at:] - np.einsum("ij,ij->j", across, solved[:, :-1])
-        z = projected[at:] - across.T @ solved[:, -1]
-        log = [scales.quick]  # of the empty set, with and without flips
-        empty = self.prior.log(frozenset())
-        alternatives = {name: sum(s.owner == name for s in self._signatures) for name in self.hypotheses}
-        for s in self._signatures:
-            share = self.prior.log(frozenset((s.owner,))) - empty - np.log(alternatives[s.owner])
-            each = zip(s.columns, s.coordinates, strict=True)
-            log.append(scales.quick + share + max(_amplitude_log_odds(z[k], square[k], c) for k, c in each))
-        return float(np.exp(scales.everyday + scales.log_prior(none) - log_sum_exp(log)))
+    def _nothing(self, scales: ScaleIntegral, gram: FloatArray) -> float:
+        """Return p(nothing) about the empty set in closed form."""
+        none = frozenset[int]()
+        ratio = self._averaged_over_scales(scales, none, gram, range(len(self._signatures)))
+        gains = gains_of(np.array([ratio[i] for i in range(len(ratio))]), self.hypotheses, self._signatures)
+        flips = float(np.exp(scales.quick - scales.everyday - scales.log_prior(none)))
+        return 1.0 / (flips + float(others_over_empty(gains, self.prior)))
 
     # --- the table ---------------------------------------------------------------------------------------------------
 
@@ -863,55 +824,3 @@ def _normal_prior(coords: Sequence[Coordinate], u: FloatArray) -> tuple[FloatArr
     found = np.array(precision)
     centre = np.array([c.centre if np.isfinite(c.scale) else x for c, x in zip(coords, u, strict=True)])
     return found, found * (centre - u)
-
-
-def _merged(raw: FloatArray, scales: Sequence[float]) -> tuple[tuple[int, int | None], ...]:
-    """Return which columns stand for which of the points: two of opposite sign are one column."""
-    found: dict[int, int | None] = {}
-    size = np.linalg.norm(raw, axis=0)
-    for k in range(raw.shape[1]):
-        opposite = [
-            j for j, other in found.items()
-            if other is None and raw[:, j] @ raw[:, k] < -0.98 * size[j] * size[k]
-            and abs(scales[j] - scales[k]) < 1e-9 * scales[k]
-        ]  # fmt: skip
-        if opposite:
-            found[opposite[0]] = k
-        else:
-            found[k] = None
-    return tuple(found.items())
-
-
-def _set_integral(z: FloatArray, gram: FloatArray, members: Sequence[_Signature]) -> tuple[float, FloatArray]:
-    """Log evidence ratio of some signatures together over none, and the coefficients at the mode."""
-    own = [k for s in members for k in s.columns]
-    coords = [c for s in members for c in s.coordinates]
-    a, b = gram[np.ix_(own, own)], z[own]
-    low = np.array([c.lower for c in coords])
-    scale = np.array([c.scale for c in coords])
-    c = np.zeros(len(own))
-    for _ in range(40):
-        before = c.copy()
-        for k in range(len(own)):
-            weight = (DEGREES + 1.0) / (DEGREES + (c[k] / scale[k]) ** 2) / scale[k] ** 2
-            c[k] = max((b[k] - a[k] @ c + a[k, k] * c[k]) / (a[k, k] + weight), low[k])
-        if np.all(np.abs(c - before) < 1e-4 * scale):
-            break
-    slope = b - a @ c
-    found = integrate(a, slope, coords, c)
-    return float(b @ c - 0.5 * c @ a @ c) + found.log_integral, c
-
-
-def _amplitude_log_odds(z: float, square: float, coordinate: Coordinate) -> float:
-    """Return the log evidence ratio of one amplitude: log integral of exp(z c - square c^2 / 2) p(c)."""
-    size = abs(z) / max(square, coordinate.scale**-2)
-    if size < 8.0 * coordinate.scale and z * size < 40.0:
-        width = min(coordinate.scale, 1.0 / np.sqrt(max(square, 1e-300)))
-        c = np.linspace(0.0 if coordinate.lower == 0.0 else -1.0, 1.0, 161) * (12.0 * width + size)
-        density = np.exp(coordinate.log_prior(c)) * (c[1] - c[0])
-        if coordinate.lower == 0.0:
-            density[0] *= 0.5
-        return float(np.log(np.exp(z * c - 0.5 * square * c**2) @ density))
-    u = np.array([max(z / max(square, 1e-300), coordinate.lower)])
-    found = integrate(np.array([[square]]), np.array([z - square * u[0]]), [coordinate], u)
-    return found.log_integral + float(z * u[0] - 0.5 * square * u[0] ** 2)

@@ -4,6 +4,7 @@
 """
 
 from lab.formats.results.diagnosis import (
+    Combination,
     DiagnosisLists,
     DiagnosisResult,
     DiagnosisVerdict,
@@ -28,6 +29,7 @@ from lab.formats.results.diagnosis import (
     RivalOdds,
     SideModels,
     Unexplained,
+    Unlisted,
     VetoedName,
     Visibility,
 )
@@ -93,6 +95,7 @@ __all__ = [
     "ChannelGeometry",
     "ChannelNoise",
     "Check",
+    "Combination",
     "ComparisonResult",
     "CornerErrors",
     "CrossValidation",
@@ -157,6 +160,7 @@ __all__ = [
     "StandardsResult",
     "StereoFit",
     "Unexplained",
+    "Unlisted",
     "ValidationResult",
     "VetoedName",
     "ViewResiduals",

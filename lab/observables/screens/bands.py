@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lab.observables.screens.canvas import LAST_BAND_CY_PER_PX, BeyondPart, Canvas, from_middle, mask_points, pixels_of
+from lab.observables.screens.canvas import LAST_BAND_CY_PER_PX, Canvas, from_middle, mask_points, pixels_of
 from lab.observables.screens.placement import ReferenceTransfer, place_slopes
 from lab.observables.screens.registration import ScreenWarp
 from sim.spectrum import FloatArray
@@ -135,10 +135,9 @@ class PlacedPattern:
         pictures = [canvas.picture(np.where(band.mask, spectrum, 0.0)) for band in self.bands]
         # with a phase of 90 degrees along the band's direction: the imaginary part of the OTF
         odd = np.array(self.odd_pieces(canvas, spectrum, mask))
-        parts = self.beyond
+        beyond = self.beyond
         if canvas is not self.canvas:
-            parts = canvas.beyond(SHARP, SHARP.fill_factor)
-        beyond = [np.sum([part.picture for part in together], axis=0) for together in parts]
+            beyond = canvas.beyond(SHARP.with_aperture)
         picture = (np.sum(pictures, axis=0) + np.sum(beyond, axis=0))[mask]
         across, down = (canvas.picture(2j * np.pi * f * spectrum)[mask] for f in (fx, fy))
         u, v, r2 = from_middle(self.seen.shape, mask_points(mask, canvas.window))
@@ -174,9 +173,9 @@ class PlacedPattern:
         )
 
     @cached_property
-    def beyond(self) -> list[list[BeyondPart]]:
+    def beyond(self) -> list[FloatArray]:
         """Return the parts of the pattern beyond the bands, as drawn for the reference pixels."""
-        return self.canvas.beyond(SHARP, SHARP.fill_factor)
+        return self.canvas.beyond(SHARP.with_aperture)
 
     @cached_property
     def halves(self) -> list[NDArray[np.bool_]]:

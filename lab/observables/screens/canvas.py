@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.interpolate import CubicSpline
 
 from lab.errors import NotDetermined
 from lab.observables.screens.registration import ScreenWarp, draw_by_area
@@ -30,13 +31,20 @@ LARGEST_PX = 320  # largest side of the window that is fitted: enough for a band
 PAIRS, TAPS = np.array([0.5, 0.5]), np.array([0.125, 0.375, 0.375, 0.125])
 MARGIN_PX = 12  # border of frame and window that isn't fitted, as the drawing lacks the light from outside
 MARGIN_CELLS = 2.0  # border of the pattern that isn't fitted
-#: Rings above 0.5 cy/px, by the larger of |fx| and fy, that alias. Each is one term of the fit and isn't reported. The
-#: inner edges divide it into finer rings, at whose mean frequencies an effect's OTF is evaluated.
-BEYOND_CY_PER_PX = ((0.5, 0.54, 0.58, 0.62), (0.62, 0.68, 0.74, 0.8), (0.8, 0.9, 1.0, 1.15, 1.35, 4.0))
+#: Edges of the rings above 0.5 cy/px, by the larger of |fx| and fy, that alias. Each is one term of the fit and isn't
+#: reported.
+BEYOND_CY_PER_PX = (0.5, 0.62, 0.8, 4.0)
+#: Frequencies between which an effect's change of the OTF is a cubic spline: of the rings, by the larger and by the
+#: smaller of |fx| and fy; of the corners between the bands and 0.5 cy/px, by hypot(fx, fy).
+RING_NODES_CY_PER_PX = (0.5, 0.56, 0.62, 0.7, 0.78, 0.86, 0.95, 1.05, 1.2, 1.35, 1.6, 2.0)
+LESSER_NODES_CY_PER_PX = (0.0, 0.15, 0.3, 0.5)
+CORNER_NODES_CY_PER_PX = (0.5, 0.57, 0.64, 0.71)
 LAST_BAND_CY_PER_PX = 0.5  # end of the bands of frequency
 LEAST_PIXELS = 1500  # of a channel
 #: Transfer function of a lens that is the same in all directions, against frequency (cy/px).
 Lens = Callable[[FloatArray], FloatArray]
+#: Transfer function of fx and fy (cy/px).
+Transfer = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 def mask_points(mask: NDArray[np.bool_], window: tuple[slice, slice]) -> FloatArray:
@@ -75,20 +83,20 @@ def pattern_window(seen: FloatArray, warp: ScreenWarp, shape: tuple[int, ...]) -
     return slices[0], slices[1]
 
 
+def beyond_reference(fx: FloatArray, fy: FloatArray) -> FloatArray:
+    """Return the transfer over which changes of the OTF beyond the bands are interpolated between their nodes: of a
+    sharp lens, without an aperture, so that it has no null."""
+    return np.asarray(np.exp(-np.power(np.hypot(fx, fy) / 1.5, 1.2)))
+
+
 @dataclass(frozen=True)
 class BeyondPart:
-    """A part of the drawn pattern at frequencies beyond the bands."""
+    """What a change of the OTF by `beyond_reference` at one node beyond the bands changes, where it is a spline with 0
+    at the other nodes."""
 
     picture: FloatArray  # at the window's pixels
-    fx: tuple[float, float]  # mean |fx| and |fy| of its power, cy/px, in two quadrants: (fx, fy) and (fx, -fy)
+    fx: tuple[float, float]  # cy/px, in two quadrants: (fx, fy) and (fx, -fy)
     fy: tuple[float, float]
-
-    @staticmethod
-    def of(picture: FloatArray, fx: FloatArray, fy: FloatArray, power: FloatArray) -> BeyondPart:
-        """Return the part whose power spectrum is `power` (rows, cols / 2 + 1), at the frequencies `fx` (1, cols / 2 +
-        1) and `fy` (rows, 1)."""
-        x, y = (float(np.average(np.broadcast_to(np.abs(f), power.shape), weights=power)) for f in (fx, fy))
-        return BeyondPart(picture, (x, x), (y, -y))
 
 
 @dataclass(frozen=True)
@@ -136,7 +144,7 @@ class Canvas:
         pixels' centres."""
         return self._below(self.drawn)
 
-    def image(self, transfer: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
+    def image(self, transfer: Transfer) -> FloatArray:
         """Return the picture (rows, cols) of the drawn pattern behind a transfer function of fx and fy (cy/px), aliases
         included."""
         return self.sampled(self.whole.spectrum * transfer(self.whole.fx, self.whole.fy))
@@ -190,32 +198,57 @@ class Canvas:
         folded = spectrum.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) * OVERSAMPLE
         return np.asarray(fft.irfft(fft.ifft(folded, axis=0), cols, axis=1)[:, ::OVERSAMPLE])
 
-    def beyond(self, lens: Lens, fill_factor: float) -> list[list[BeyondPart]]:
-        """Return the aliased parts of the picture, from frequencies above 0.5 cy/px: a list for each ring and each pair
-        of opposite sectors (|fx| >= |fy| or not), of its finer rings. The first list is of the frequencies below 0.5
-        cy/px along both axes that no band has.
+    def beyond(self, transfer: Transfer) -> list[FloatArray]:
+        """Return the aliased parts of the picture behind a transfer function, from frequencies above 0.5 cy/px: a
+        picture for each ring and each pair of opposite sectors (|fx| >= |fy| or not). The first is of the frequencies
+        below 0.5 cy/px along both axes that no band has.
 
         Where cells are a whole number of pixels the spectrum repeats, and aliases are coherent with what lies below 0.5
         cy/px."""
-        fy, fx = self.frequencies
-        beside = (np.hypot(fx, fy) >= LAST_BAND_CY_PER_PX) & (np.abs(fy) < 0.5) & (fx < 0.5)
-        corner = np.where(beside, self.low * self.passed(lens, fill_factor), 0.0)
-        above = self._above(lens, fill_factor)
-        found = [[BeyondPart.of(self.picture(corner), fx, fy, np.abs(corner) ** 2)]]
-        for edges in BEYOND_CY_PER_PX:
-            for side in (above.fx >= np.abs(above.fy), above.fx < np.abs(above.fy)):
-                parts = []
-                for low, end in pairwise(edges):
-                    part = np.where(above.between(low, end) & side, above.spectrum, 0.0)
-                    power = np.abs(part) ** 2
-                    if power.any():
-                        parts.append(BeyondPart.of(self._aliased(part, above.rows), above.fx, above.fy, power))
-                if parts:
-                    found.append(parts)
+        found = [self.picture(self._corner(transfer))]
+        above = self._above(transfer)
+        for low, end in pairwise(BEYOND_CY_PER_PX):
+            for side in above.sides:
+                part = np.where((above.largest >= low) & (above.largest < end) & side, above.spectrum, 0.0)
+                if part.any():
+                    found.append(self._aliased(part, above.rows))
         return found
 
-    def _above(self, lens: Lens, fill_factor: float) -> _Above:
-        """Return the spectrum of the drawn pattern behind lens and pixel, up to the highest frequency drawn."""
+    @cached_property
+    def beyond_parts(self) -> list[BeyondPart]:
+        """Return what changes of the OTF beyond the bands change, by their nodes."""
+        fy, fx = self.frequencies
+        corner, radius = self._corner(beyond_reference), np.hypot(fx, fy)
+        found = []
+        for side, flat in ((fx >= np.abs(fy), True), (fx < np.abs(fy), False)):
+            power = np.where(side, np.abs(corner) ** 2, 0.0)
+            lesser = np.arctan2(np.minimum(fx, np.abs(fy)), np.maximum(fx, np.abs(fy)))
+            angle = float(np.average(lesser, weights=power))
+            for node, weight in zip(CORNER_NODES_CY_PER_PX, _splines(radius, CORNER_NODES_CY_PER_PX), strict=True):
+                x, y = node * np.cos(angle), node * np.sin(angle)
+                x, y = (x, y) if flat else (y, x)
+                found.append(BeyondPart(self.picture(np.where(side, weight * corner, 0.0)), (x, x), (y, -y)))
+        above = self._above(beyond_reference)
+        lesser = np.minimum(above.fx, np.abs(above.fy))
+        outside = np.where(above.largest >= LAST_BAND_CY_PER_PX, above.spectrum, 0.0)
+        along = _splines(above.largest, RING_NODES_CY_PER_PX)
+        across = _splines(lesser, LESSER_NODES_CY_PER_PX, even=True)
+        for side, flat in zip(above.sides, (True, False), strict=True):
+            for larger, weight in zip(RING_NODES_CY_PER_PX, along, strict=True):
+                part = np.where(side, weight * outside, 0.0)
+                for smaller, share in zip(LESSER_NODES_CY_PER_PX, across, strict=True):
+                    x, y = (larger, smaller) if flat else (smaller, larger)
+                    found.append(BeyondPart(self._aliased(part * share, above.rows), (x, x), (y, -y)))
+        return found
+
+    def _corner(self, transfer: Transfer) -> NDArray[np.complex128]:
+        """Return the spectrum behind a transfer function at the frequencies below 0.5 cy/px that no band has."""
+        fy, fx = self.frequencies
+        inside = (np.hypot(fx, fy) >= LAST_BAND_CY_PER_PX) & (np.abs(fy) < 0.5) & (fx < 0.5)
+        return np.where(inside, self.low * transfer(fx, fy), 0.0)
+
+    def _above(self, transfer: Transfer) -> _Above:
+        """Return the spectrum of the drawn pattern behind a transfer function, up to the highest frequency drawn."""
         rows, cols = (OVERSAMPLE * n for n in self.shape)
         highest = 0.5 * OVERSAMPLE
         keep = np.abs(fft.fftfreq(rows, 1.0 / OVERSAMPLE)) < highest
@@ -223,9 +256,7 @@ class Canvas:
         fx = fft.rfftfreq(cols, 1.0 / OVERSAMPLE)[None, :]
         fx = fx[:, fx[0] < highest]
         radius = np.hypot(fy, fx)
-        high = (
-            self.drawn[keep][:, : fx.shape[1]] * lens(np.minimum(radius, highest)) * aperture_otf(fx, fy, fill_factor)
-        )
+        high = self.drawn[keep][:, : fx.shape[1]] * transfer(fx, fy)
         high *= np.exp(1j * np.pi * fx * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fx / OVERSAMPLE)
         high *= np.exp(1j * np.pi * fy * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fy / OVERSAMPLE)
         return _Above(np.where(radius < highest, high, 0.0), fx, fy, keep)
@@ -259,10 +290,23 @@ class _Above:
     fy: FloatArray  # (kept rows, 1), cy/px
     rows: NDArray[np.bool_]  # mask of the kept rows
 
-    def between(self, low: float, end: float) -> NDArray[np.bool_]:
-        """Mask of the frequencies with low <= max(|fy|, fx) < end."""
-        largest = np.maximum(np.abs(self.fy), self.fx)
-        return np.asarray((largest >= low) & (largest < end))
+    @cached_property
+    def largest(self) -> FloatArray:
+        """Larger of |fy| and fx, cy/px."""
+        return np.asarray(np.maximum(np.abs(self.fy), self.fx))
+
+    @property
+    def sides(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Masks of the frequencies with fx >= |fy|, and of the others."""
+        return self.fx >= np.abs(self.fy), self.fx < np.abs(self.fy)
+
+
+def _splines(value: FloatArray, nodes: Sequence[float], *, even: bool = False) -> FloatArray:
+    """Return the weights (nodes, *value) by which a cubic spline through values at `nodes` takes each of them, constant
+    beyond the last node. `even`: its slope at the first node is 0."""
+    ends = ((1, np.zeros(len(nodes))) if even else "not-a-knot", "not-a-knot")
+    weights = CubicSpline(nodes, np.eye(len(nodes)), bc_type=ends)(np.clip(value, nodes[0], nodes[-1]))
+    return np.asarray(np.moveaxis(weights, -1, 0))
 
 
 def pixels_of(canvas: Canvas, seen: FloatArray, places: Sequence[tuple[int, int]], step: int) -> NDArray[np.bool_]:

@@ -10,7 +10,15 @@ from lab.observables.dataset import Dataset
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import SHOWN
 from lab.observables.screens.bands import RINGS_CY_PER_PX
-from lab.observables.screens.patterns import EVEN_ORDER, EVEN_TERMS, Pattern, joint_covariance, patterns, place_jacobian
+from lab.observables.screens.canvas import beyond_reference
+from lab.observables.screens.patterns import (
+    EVEN_ORDER,
+    EVEN_TERMS,
+    Pattern,
+    joint_covariance,
+    patterns,
+    place_jacobian,
+)
 from lab.observables.screens.placement import even_powers
 from sim.effects.base import Effects
 from sim.point import TRANSFER_AT, common_wavelengths, detected_transfer, mix_channels, mixes_colours, transfer_at
@@ -25,6 +33,7 @@ CONTRAST_SCALE_STD = (
     0.01  # prior standard deviation of the contrast's scale, for each channel of seen and held-out repeats
 )
 SCREEN_BLUR_PX = 0.08  # prior standard deviation of the Gaussian blur of the cells' borders
+LEAST_TRANSFER = 1e-3  # of the baseline, below which a band's OTF has no ratio to it
 PLACINGS = 4  # Gauss-Newton steps that find an image's shift
 
 
@@ -62,19 +71,21 @@ def measure_bernoulli(dataset: Dataset) -> Observable:
         parts.append(b)
     poses = [sights for sights in poses if sights]
     plain = [_transfers(dataset, sights, ()) for sights in poses]
-    weights = {id(p): _node_weights(p) for sights in poses for p, *_ in sights.values()}
+    weights = [[_node_weights(p) for p, *_ in sights.values()] for sights in poses]
 
     def predict(effects: Effects) -> Prediction:
         mean = expected.copy()
         if effects:
-            for sights, before in zip(poses, plain, strict=True):
-                changed = _transfers(dataset, sights, effects) / np.where(np.abs(before) > 1e-3, before, np.inf)
-                for (p, members, parts), ratio in zip(sights.values(), changed, strict=True):
-                    real, imaginary, outside = weights[id(p)]
-                    within, beyond = np.split(ratio, [real.shape[1]])
-                    placed = _in_place(p, within)
+            for sights, of_nodes, before in zip(poses, weights, plain, strict=True):
+                after = _transfers(dataset, sights, effects)
+                for (p, members, parts), (real, imaginary, outside), otf, plain_otf in zip(
+                    sights.values(), of_nodes, after, before, strict=True
+                ):
+                    within = real.shape[1]
+                    ratio = otf / np.where(np.abs(plain_otf) > LEAST_TRANSFER, plain_otf, np.inf)
+                    placed = _in_place(p, ratio[:within])
                     change = real @ (np.real(placed) - 1.0) + imaginary @ np.imag(placed)
-                    change = change + outside @ (np.real(beyond) - 1.0) + p.shown_by(effects)[: len(real)]
+                    change = change + outside @ np.real(otf - plain_otf)[within:] + p.shown_by(effects)[: len(real)]
                     mean[members] += reference[members] * change[parts]
             mean = np.where(np.isfinite(mean), mean, expected)
         jacobian = by_place | {"pattern:blur": -2.0 * np.square(np.pi * SCREEN_BLUR_PX * frequency) * mean}
@@ -110,8 +121,8 @@ def _transfers(
 
 def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Weights that take a ratio of OTFs to the bands' coefficients: of its real part and of its imaginary part at the
-    bands' nodes, (bands, nodes) each, and of its real part at the frequencies of the parts beyond, (bands,
-    frequencies).
+    bands' nodes, (bands, nodes) each; and that take a change of the OTF to them, at the nodes beyond the bands, (bands,
+    nodes).
 
     The real part is split into even powers of the frequency, fitted over the nodes by least squares, and a rest. The
     rest, and the imaginary part, enter by their means over the lower and the upper half of each band.
@@ -130,7 +141,8 @@ def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:
     powers = np.transpose(even_powers(fx, fy, EVEN_ORDER, RINGS_CY_PER_PX[-1]))
     weight = np.sqrt(np.concatenate([band.power * band.share for band in p.bands]))
     fit = np.linalg.pinv(weight[:, None] * powers) * weight
-    outside = 0.5 * np.repeat(by_part, 2, axis=1)  # two frequencies each
+    outside = 0.5 * np.repeat(by_part, 2, axis=1)  # in two quadrants each
+    outside /= beyond_reference(p.beyond[:, 0].ravel(), p.beyond[:, 1].ravel())
     return smooth @ fit + by_half @ (halves - halves @ powers @ fit), by_phase @ halves, outside
 
 

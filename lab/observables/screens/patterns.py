@@ -54,10 +54,10 @@ class Pattern:
     common: FloatArray  # (k, k): covariance by what seen and held-out repeats share: white and black
     by_place: FloatArray  # (k, directions): change by the independent errors of the pattern's place
     #: (bands, EVEN_TERMS + 4 bands + parts): change of the bands' coefficients by a unit of even powers of the
-    #: frequency times the baseline's P, of the halves of the bands, of these with a phase of 90 degrees, and of the
-    #: parts beyond the bands.
+    #: frequency times the baseline's P, of the halves of the bands, of these with a phase of 90 degrees, and of changes
+    #: of the OTF by `beyond_reference` at the nodes beyond the bands.
     mix: FloatArray
-    beyond: FloatArray  # (parts, 2, 2): (fx, fy) of the parts beyond the bands, cy/px, each at two frequencies
+    beyond: FloatArray  # (nodes, 2, 2): (fx, fy) of the nodes beyond the bands, cy/px, each in two quadrants
     shown_by: Callable[[Effects], FloatArray]  # change of the coefficients by effects on the screen's light
     levels_e: tuple[float, float]  # electrons on dark and on lit cells
     light: Spectrum | None
@@ -212,14 +212,13 @@ class _Baseline:
         fy, fx = canvas.frequencies
         inside = np.hypot(fx, fy) < RINGS_CY_PER_PX[-1]
         powers = even_powers(fx, fy, EVEN_ORDER, RINGS_CY_PER_PX[-1])
-        parts = [part for together in canvas.beyond(lens, camera.fill_factor) for part in together]
         pieces = [
             *(canvas.picture(np.where(inside, term * spectrum, 0.0))[mask] for term in powers),
             *(canvas.picture(np.where(half, spectrum, 0.0))[mask] for half in placed.halves),
             *placed.odd_pieces(canvas, spectrum, mask),
-            *(part.picture[mask] for part in parts),
+            *(gain * part.picture[mask] for part in canvas.beyond_parts),
         ]
-        at = [part for together in placed.beyond for part in together]
+        at = placed.canvas.beyond_parts
 
         @lru_cache(maxsize=8)
         def changed(showing: tuple[Effect, ...]) -> FloatArray:

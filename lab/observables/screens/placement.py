@@ -53,6 +53,10 @@ class ReferenceTransfer:
         """Return the transfer without the aperture at frequencies, cy/px."""
         return np.asarray(np.exp(-np.power(np.abs(radius) / self.frequency_cy_per_px, self.exponent)))
 
+    def with_aperture(self, fx: FloatArray, fy: FloatArray) -> FloatArray:
+        """Return the transfer with the aperture at frequencies, cy/px."""
+        return np.asarray(self(np.hypot(fx, fy)) * aperture_otf(fx, fy, self.fill_factor))
+
     @property
     def fill_factor(self) -> float:
         """Return the area of the aperture, px^2."""
@@ -168,10 +172,7 @@ class _PlacedPattern:
     def _drawn(self, transfer: ReferenceTransfer) -> FloatArray:
         """Return the pattern's image (n,) behind a transfer and the pixel's aperture."""
 
-        def blurred(fx: FloatArray, fy: FloatArray) -> FloatArray:
-            return np.asarray(transfer(np.hypot(fx, fy)) * aperture_otf(fx, fy, transfer.fill_factor))
-
-        return np.asarray(self.canvas.image(blurred)[self.mask])
+        return np.asarray(self.canvas.image(transfer.with_aperture)[self.mask])
 
     def fit_blur(self) -> _PlacedPattern:
         """Fit the reference transfer: Gauss-Newton steps with free levels of dark and lit cells."""
@@ -270,8 +271,7 @@ def place_slopes(canvas: Canvas, mask: np.ndarray, warp: ScreenWarp, transfer: R
     """Return the change (2 terms, n) of the drawn image at the n pixels of `mask` by each term of the displacement of
     `warp` in x, then in y."""
     whole = canvas.whole
-    drawn = whole.spectrum * transfer(np.hypot(whole.fx, whole.fy))
-    drawn = drawn * aperture_otf(whole.fx, whole.fy, transfer.fill_factor)
+    drawn = whole.spectrum * transfer.with_aperture(whole.fx, whole.fy)
     across, down = (canvas.sampled(2j * np.pi * f * drawn)[mask] for f in (whole.fx, whole.fy))
     terms = warp.basis(mask_points(mask, canvas.window))
     return np.concatenate([across * terms, down * terms])

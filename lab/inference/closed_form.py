@@ -1,0 +1,308 @@
+"""The closed form: evidences of further hypotheses about a fitted set, with the prediction linear in them.
+
+With the whitened residual r and the whitened signatures G, z = G'r and R = G'G give
+
+    log p(y | A + k) / p(y | A) = log integral exp(c'z - c'R c / 2) p(c) dc
+
+over the coefficients c of the signatures of k. The groups of small physics are projected out of z and R at given
+scales; the ratio is averaged over these scales. The same integrals give the distribution of p(nothing) over healthy
+draws (`HealthyDraws`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import logsumexp
+
+from lab.inference.hypotheses import DEGREES, Coordinate, Hypothesis, SetPrior, symmetric
+from lab.inference.laplace import integrate
+from lab.inference.model import Model, ScaleIntegral
+from sim.spectrum import FloatArray
+
+#: Scales of the groups, drawn from their prior, over which healthy draws are averaged; those at which flips are.
+SCALES_DRAWN, SCALES_FLIPPED = 12, 4
+#: Gain of log evidence up to which the recordings say little of a set beyond its nearest refitted subset: the closed
+#: form is as good as a refit there, and the evidences of such members multiply.
+SILENT = 1.0
+#: Standard deviations of an amplitude above which it is integrated about its mode.
+STRONG = 6.0
+#: Largest signal of several amplitudes that are integrated one after the other, in standard deviations.
+_WEAK = 3.0
+#: Points of a table of one amplitude's log odds over z, and of its size.
+_TABLE, _SIZES = 17, 48
+_HERMITE = np.polynomial.hermite_e.hermegauss(9)
+_HERMITE = (_HERMITE[0], _HERMITE[1] / _HERMITE[1].sum())
+#: Distance from the mode beyond which an amplitude is integrated along with those near 0: that of the last point.
+_BEYOND = 4.5
+
+
+@dataclass(frozen=True)
+class Signature:
+    """An alternative's changes of the prediction (n, k), given no other hypothesis."""
+
+    owner: str
+    index: int  # of the alternative
+    raw: FloatArray
+    coordinates: tuple[Coordinate, ...]  # of the coefficients
+    columns: tuple[int, ...]  # in the stacked table
+    points: tuple[tuple[int, int | None], ...]  # of each column, the alternative's points of positive and negative sign
+
+    def of_points(self, c: FloatArray, count: int) -> FloatArray:
+        """Return the coefficients (>= 0) of all points of the alternative, given those of the columns."""
+        found = np.zeros(count)
+        for (plus, minus), one in zip(self.points, c, strict=True):
+            if one >= 0.0 or minus is None:
+                found[plus] = max(one, 0.0)
+            else:
+                found[minus] = -one
+        return found
+
+
+def signatures_of(model: Model, hypotheses: Mapping[str, Hypothesis]) -> tuple[Signature, ...]:
+    """Return the signatures of all alternatives that change the prediction at all."""
+    base = model.mean({})
+    found: list[Signature] = []
+    at = 0
+    for name, hypothesis in hypotheses.items():
+        for index, alternative in enumerate(hypothesis.alternatives):
+            raw = np.column_stack([model.mean({name: p}) - base for p in alternative.points])
+            if not raw.any():
+                continue
+            points = _merge_opposite(raw, alternative.scales)
+            raw = raw[:, [plus for plus, _ in points]]
+            coords = tuple(
+                Coordinate("c", alternative.scales[plus], lower=0.0 if minus is None else -np.inf)
+                for plus, minus in points
+            )
+            columns = tuple(range(at, at + raw.shape[1]))
+            found.append(Signature(name, index, raw, coords, columns, points))
+            at += raw.shape[1]
+    return tuple(found)
+
+
+def _merge_opposite(raw: FloatArray, scales: Sequence[float]) -> tuple[tuple[int, int | None], ...]:
+    """Return which columns stand for which of the points: two of opposite sign are one column."""
+    found: dict[int, int | None] = {}
+    size = np.linalg.norm(raw, axis=0)
+    for k in range(raw.shape[1]):
+        opposite = [
+            j for j, other in found.items()
+            if other is None and raw[:, j] @ raw[:, k] < -0.98 * size[j] * size[k]
+            and abs(scales[j] - scales[k]) < 1e-9 * scales[k]
+        ]  # fmt: skip
+        if opposite:
+            found[opposite[0]] = k
+        else:
+            found[k] = None
+    return tuple(found.items())
+
+
+def project_groups(gram: FloatArray, amplitude: FloatArray) -> FloatArray:
+    """Return the Gram matrix of all columns after the first R with these marginalised, whose coefficients have the
+    standard deviations `amplitude` (R,)."""
+    at = len(amplitude)
+    inner = np.eye(at) + amplitude[:, None] * gram[:at, :at] * amplitude
+    across = amplitude[:, None] * gram[:at, at:]
+    solved = cho_solve(cho_factor(inner, lower=True, check_finite=False), across, check_finite=False)
+    return np.asarray(gram[at:, at:] - across.T @ solved)
+
+
+def integrate_set(z: FloatArray, gram: FloatArray, members: Sequence[Signature]) -> tuple[float, FloatArray]:
+    """Log evidence ratio of some signatures together over none, and the coefficients at the mode."""
+    own = [k for s in members for k in s.columns]
+    coords = [c for s in members for c in s.coordinates]
+    a, b = gram[np.ix_(own, own)], z[own]
+    low = np.array([c.lower for c in coords])
+    scale = np.array([c.scale for c in coords])
+    c = np.zeros(len(own))
+    for _ in range(40):
+        before = c.copy()
+        for k in range(len(own)):
+            weight = (DEGREES + 1.0) / (DEGREES + (c[k] / scale[k]) ** 2) / scale[k] ** 2
+            c[k] = max((b[k] - a[k] @ c + a[k, k] * c[k]) / (a[k, k] + weight), low[k])
+        if np.all(np.abs(c - before) < 1e-4 * scale):
+            break
+    slope = b - a @ c
+    found = integrate(a, slope, coords, c)
+    return float(b @ c - 0.5 * c @ a @ c) + found.log_integral, c
+
+
+def amplitude_log_odds(z: FloatArray, square: FloatArray, scale: FloatArray, positive: np.ndarray) -> FloatArray:
+    """Return the log evidence ratios log integral exp(z c - square c^2 / 2) p(c) dc of single amplitudes, all (m,).
+
+    p is Student's t of this scale, of c > 0 where `positive`. In x = c sqrt(square) the data's part has unit width; its
+    points lie closer towards 0, where the prior may be narrower. Amplitudes above `STRONG` standard deviations are
+    integrated about the data's mode, which the prior bends little."""
+    root = np.sqrt(np.maximum(square, 1e-300))
+    signal, width = z / root, scale * root
+    size = np.abs(signal)
+    strong = np.where(positive, signal, size) > STRONG
+    x, weight = _sizes(np.minimum(width, 1.0 / np.maximum(size, 1.0)), np.where(strong, size - _BEYOND, STRONG + 6.0))
+    fall = _log_student(x / width[:, None]) - np.log(width)[:, None] + np.log(weight) - 0.5 * x * x
+    odds = logsumexp(fall + signal[:, None] * x, axis=1)
+    odds = np.where(positive, odds + np.log(2.0), np.logaddexp(odds, logsumexp(fall - signal[:, None] * x, axis=1)))
+    if strong.any():
+        about = size[strong, None] + _HERMITE[0]
+        peak = logsumexp(_log_student(about / width[strong, None]) + np.log(_HERMITE[1]), axis=1)
+        peak += 0.5 * np.square(size[strong]) - np.log(width[strong]) + 0.5 * np.log(2.0 * np.pi)
+        odds[strong] = np.logaddexp(odds[strong], peak + np.where(positive[strong], np.log(2.0), 0.0))
+    return np.asarray(odds)
+
+
+def _log_student(t: FloatArray) -> FloatArray:
+    """Log density of Student's t with three degrees of freedom."""
+    return np.asarray(np.log(2.0 / (np.pi * np.sqrt(3.0))) - 2.0 * np.log1p(np.square(t) / 3.0))
+
+
+def _sizes(least: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points and weights (m, p) of the integrals from 0 to `end` (m,), at 0 as close as a tenth of `least` (m,)."""
+    share, weight = np.polynomial.legendre.leggauss(_SIZES)
+    first = 0.1 * np.maximum(least, 1e-6)[:, None]
+    last = np.arcsinh(end[:, None] / first)
+    t = 0.5 * (share + 1.0) * last
+    return np.asarray(first * np.sinh(t)), np.asarray(0.5 * weight * last * first * np.cosh(t))
+
+
+def signature_log_odds(z: FloatArray, gram: FloatArray, signatures: Sequence[Signature]) -> FloatArray:
+    """Return the log evidence ratios (s,) of single signatures, of z (m,) and R (m, m) of all columns.
+
+    Of several columns with weak signals, each is integrated with those before it marginalised, or at 0 where they are
+    at their bound; of those with strong ones, all together (`integrate_set`)."""
+    found = np.zeros(len(signatures))
+    signal = np.abs(z) / np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    parts: list[tuple[int, float, float, float, bool]] = []
+    for i, s in enumerate(signatures):
+        own = list(s.columns)
+        if len(own) > 1 and signal[own].max() > _WEAK:
+            found[i] = integrate_set(z, gram, [s])[0]
+            continue
+        b, a = z[own], gram[np.ix_(own, own)]
+        for k, c in enumerate(s.coordinates):
+            positive = bool(np.isfinite(c.lower))
+            parts.append((i, b[k], max(a[k, k], 1e-9 * gram[own[k], own[k]]), c.scale, positive))
+            curvature = a[k, k] + c.scale**-2.0
+            if k + 1 < len(own) and not (positive and b[k] <= 0.0):
+                share = a[k] / curvature
+                b, a = b - share * b[k], a - share[:, None] * a[k]
+    if parts:
+        index, left, square, scale, positives = (np.array(column) for column in zip(*parts, strict=True))
+        np.add.at(found, index, amplitude_log_odds(left, square, scale, positives))
+    return found
+
+
+def log_odds_of_draws(z: FloatArray, square: float, coordinate: Coordinate) -> FloatArray:
+    """Return `amplitude_log_odds` of many z (D,) of one signature, by a table over z. Between its points the log odds
+    bend by 1 / square at most, so that lines are right to 0.03 where z spans eight standard deviations."""
+    nodes = np.linspace(z.min(), z.max(), _TABLE)
+    root = float(np.sqrt(max(square, 1e-300)))
+    width, end = coordinate.scale * root, 6.0 + float(np.abs(nodes).max()) / root
+    x, weight = _sizes(np.array([min(width, 0.2)]), np.array([end]))
+    fall = (_log_student(x / width) - np.log(width) + np.log(weight) - 0.5 * x * x)[0]
+    exponent = fall + nodes[:, None] / root * x
+    if not np.isfinite(coordinate.lower):
+        exponent = np.concatenate([exponent, fall - nodes[:, None] / root * x], axis=1) - np.log(2.0)
+    top = exponent.max(axis=1)
+    odds = top + np.log(np.exp(exponent - top[:, None]).sum(axis=1)) + np.log(2.0)
+    return np.asarray(np.interp(z, nodes, odds))
+
+
+def log_mean_exp(values: FloatArray) -> FloatArray:
+    """Log of the mean of exp along the first axis."""
+    top = values.max(axis=0)
+    return np.asarray(top + np.log(np.mean(np.exp(values - top), axis=0)))
+
+
+@dataclass(frozen=True)
+class HealthyDraws:
+    """Draws without effects or unlisted physics in whitened coordinates: noise, theta and everyday delta of their
+    priors. `gram` (K, K): M of the groups' columns and all signatures; `projected` (K, D): W'r of the draws; `square`
+    (D,): r'r."""
+
+    gram: FloatArray
+    projected: FloatArray
+    square: FloatArray
+    scales: ScaleIntegral
+
+    @classmethod
+    def of(
+        cls, model: Model, signatures: Sequence[Signature], any_unlisted: float, draws: int, rng: np.random.Generator
+    ) -> HealthyDraws:
+        """Draw."""
+        groups = tuple(model.groups)
+        sizes = tuple(g.columns.shape[1] for g in groups)
+        at, none = sum(sizes), np.zeros(0)
+        columns = np.concatenate([*(g.columns for g in groups), *(s.raw for s in signatures)], axis=1)
+        white = model.gaussian({}, 0.0).whiten(columns)
+        gram = white.T @ white
+        tau = np.array([[g.everyday] for g in groups]) * np.abs(rng.standard_normal((len(groups), draws)))
+        delta = np.repeat(tau, sizes, axis=0) * rng.standard_normal((at, draws))
+        residual = rng.standard_normal((len(white), draws)) + white[:, :at] @ delta
+        priors = ScaleIntegral.log_priors(len(groups), any_unlisted)
+        scales = ScaleIntegral(gram[:at, :at], none, sizes, none, groups, priors)
+        return cls(gram, white.T @ residual, np.square(residual).sum(axis=0), scales)
+
+    def one(self, d: int) -> tuple[ScaleIntegral, FloatArray]:
+        """Return the integral over the scales of one draw, and the Gram matrix of all columns and its residual."""
+        own = self.projected[:, d : d + 1]
+        whole = np.block([[self.gram, own], [own.T, self.square[d : d + 1, None]]])
+        return replace(self.scales, projected=own[: len(self.scales.gram), 0], _known={}), whole
+
+    def screen(
+        self, hypotheses: Iterable[str], signatures: Sequence[Signature], prior: SetPrior, rng: np.random.Generator
+    ) -> FloatArray:
+        """Return p(no effect, nothing unlisted) of all draws, (D,), roughly: scales by a Latin hypercube of their
+        prior, one for all draws; of several columns of a signature the likeliest."""
+        groups, draws, at = self.scales.groups, self.projected.shape[1], len(self.scales.gram)
+        strata = [(rng.permutation(SCALES_DRAWN) + 0.5) / SCALES_DRAWN for _ in groups]
+        drawn = np.array([g.everyday_quantile(s) for g, s in zip(groups, strata, strict=True)])
+        drawn = drawn.reshape(len(groups), SCALES_DRAWN).T
+        log_likelihood = np.empty((SCALES_DRAWN, draws))
+        odds = np.empty((SCALES_DRAWN, len(signatures), draws))
+        both = np.block([[self.gram, self.projected], [self.projected.T, np.zeros((draws, draws))]])
+        for j, tau in enumerate(drawn):
+            left = project_groups(both, np.repeat(tau, self.scales.group_sizes))
+            split = len(left) - draws
+            log_likelihood[j] = -0.5 * np.diag(left)[split:] - self.scales.log_det(tau)
+            for i, s in enumerate(signatures):
+                each = zip(s.columns, s.coordinates, strict=True)
+                odds[j, i] = np.max([log_odds_of_draws(left[k, split:], float(left[k, k]), c) for k, c in each], axis=0)
+        ratio = log_mean_exp(log_likelihood[:, None, :] + odds) - log_mean_exp(log_likelihood)
+        flips = [np.zeros(draws)]
+        for g, group in enumerate(groups):
+            usual, other = group.scales(False), group.scales(True)
+            points = np.concatenate([usual, other])
+            values = np.array([
+                self.scales.profiles(g, tau, points, self.projected[:at])
+                for tau in drawn[:: SCALES_DRAWN // SCALES_FLIPPED]
+            ])  # fmt: skip
+            usual_log = log_mean_exp(values[:, : len(usual)].reshape(-1, draws))
+            other_log = log_mean_exp(values[:, len(usual) :].reshape(-1, draws))
+            flips.append(other_log - usual_log + self.scales.prior_log[1] - self.scales.prior_log[0])
+        gains = gains_of(ratio, hypotheses, signatures)
+        return 1.0 / (np.exp(logsumexp(flips, axis=0)) + others_over_empty(gains, prior))
+
+
+def gains_of(
+    ratio: FloatArray, hypotheses: Iterable[str], signatures: Sequence[Signature]
+) -> dict[str, FloatArray]:  # fmt: skip
+    """Return the log evidence ratios of hypotheses: the mean over their alternatives of those of their signatures (s,)
+    or (s, D)."""
+    own: dict[str, list[int]] = {}
+    for i, s in enumerate(signatures):
+        own.setdefault(s.owner, []).append(i)
+    return {name: log_mean_exp(ratio[own[name]]) for name in hypotheses if name in own}
+
+
+def others_over_empty(gains: Mapping[str, FloatArray], prior: SetPrior) -> FloatArray:
+    """Return the probability of all other sets over that of the empty one, of the log evidence ratios of single
+    hypotheses: of the sets of which at most one member gains more than `SILENT`; the evidences of the others
+    multiply."""
+    weight = {name: prior.weight[name] * np.exp(np.minimum(gain, 500.0)) for name, gain in gains.items()}
+    silent = [np.where(gains[name] <= SILENT, w, 0.0) for name, w in weight.items()]
+    loud = np.sum([np.where(gains[name] > SILENT, w, 0.0) for name, w in weight.items()], axis=0)
+    sums = symmetric(silent, len(prior.number) - 1)
+    total = sum(prior.scale(k) * (sums[k] + loud * sums[k - 1]) for k in range(1, len(prior.number)))
+    return np.asarray(total / prior.scale(0))
