@@ -272,8 +272,8 @@ BIASES = (
     ),
     (
         "e-SFR of one plane of a Bayer mosaic, bins of 1/2 px of the sensor",
-        "SFR50 lower by 5 to 17 % at 0.39 cy/px (four edges)",
-        "recordings of an independent simulator",
+        "SFR50 −5 to −17 % at 0.39 cy/px (four edges), −6 to +1.5 % at 0.31 cy/px (nine edges), each ± 1 to 4 %",
+        "recordings of an independent simulator; the mock bench",
     ),
     (
         "K of EMVA 1288, straight line to 70 %",
