@@ -344,7 +344,7 @@ def _covariance(
 
 def size_covariance(
     model: MeasurementModel, effects: Effects, index: int
-) -> tuple[list[Coordinate], FloatArray, FloatArray]:
+) -> tuple[list[EffectCoordinate], FloatArray, FloatArray]:
     """Return the coordinates that size member `index`, theirs less those of absence (k,), and their posterior
     covariance (k, k), that of its shapes and of the other members marginalised."""
     coords = coordinates(effects, model.camera)
@@ -358,7 +358,7 @@ def size_covariance(
 
 
 def _posterior_covariance(
-    model: MeasurementModel, effects: Effects, coords: Sequence[Coordinate]
+    model: MeasurementModel, effects: Effects, coords: Sequence[EffectCoordinate]
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Coordinates (p,), their posterior covariance (p, p), and which of them anything bounds (p,)."""
     u = np.array([c.to_u(float(getattr(effects[c.index], c.name))) for c in coords])

@@ -341,7 +341,7 @@ def _colour_temperatures(camera: CameraModel, station: Equipment) -> Iterator[Ca
 
         mean = predict(Hypothesis("", (), camera))
         noise = (mean + camera.read_noise_e**2) / (PIXELS * REPEATS)
-        floor = np.square(mean) * (NARROWBAND_FLOOR**2 + CURVE_ROUGH_STD**2)
+        floor = np.square(CURVE_ROUGH_STD * mean)
         black = (BLACK_FLOOR_DN / camera.conversion_gain_dn_per_e) ** 2
         flats = FlatSequence(levels=(FILLED,), frames=REPEATS, lamp_level=1.0, colour_temperature_k=kelvin)
         yield CandidateCapture(

@@ -215,7 +215,7 @@ def plain_name(field: str, unit: str) -> str:
 
 def _size(field: str, value: ParameterValue) -> str:
     """Return a parameter in words, with what its interval tells."""
-    text = f"{_plain_name(field, value.unit)} {measured(value.value, value.std, value.unit, value.interval)}"
+    text = f"{plain_name(field, value.unit)} {measured(value.value, value.std, value.unit, value.interval)}"
     return text if value.is_determined else f"{text}, not determined"
 
 

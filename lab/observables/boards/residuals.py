@@ -178,7 +178,8 @@ def shifts_px(dataset: Dataset, place: FloatArray, effects: Effects) -> FloatArr
     pitch, middle = camera.pixel_pitch_um, 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
     found = np.zeros_like(place)
     for _ in range(PLACING_STEPS if effects else 0):
-        shift = displaced_um(camera, *((place - found - middle) * pitch).T, REFERENCE_NM, effects)
+        x_um, y_um = ((place - found - middle) * pitch).T
+        shift = displaced_um(camera, x_um, y_um, REFERENCE_NM, effects)
         if shift is None:
             break
         found = np.column_stack(shift) / pitch
