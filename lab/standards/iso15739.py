@@ -33,9 +33,10 @@ class Iso15739(Standard):
         NotDone(
             "Annex B",
             "visual noise",
-            "the annex's text was not at hand, and the normalisation of its contrast sensitivities sets the scale of the figure",
+            "the annex's text was not at hand; the normalisation of its contrast sensitivities sets the scale",
         ),
     )
+
 
     def __init__(self, side: MeasuredSide, steps: ToneSteps) -> None:
         super().__init__(side, f"plane {steps.plane}")

@@ -50,8 +50,8 @@ def figures(result: dict[str, Any], side: str, standard: str) -> dict[str, list[
 
 
 def truths_are_recovered(result: dict[str, Any], side: str) -> None:
-    """K and temporal dark noise of four planes, and the local distortion: within 4 standard uncertainties. Of nine normal
-    scores one is beyond by chance in 0.06 % of all sessions."""
+    """K and temporal dark noise of four planes, and the local distortion: within 4 standard uncertainties. Of nine
+    normal scores one is beyond by chance in 0.06 % of all sessions."""
     truth = TRUTH.cameras[side].model
     linear = figures(result, side, "EMVA 1288 R4.0 Linear")
     for name, value in (
