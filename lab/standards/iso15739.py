@@ -37,7 +37,6 @@ class Iso15739(Standard):
         ),
     )
 
-
     def __init__(self, side: MeasuredSide, steps: ToneSteps) -> None:
         super().__init__(side, f"plane {steps.plane}")
         self.steps = steps
