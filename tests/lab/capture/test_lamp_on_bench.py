@@ -37,7 +37,7 @@ SHAPE = (60, 80)
 
 class LampStation:
     """A bench of small frames with its light source, radiometer, stage and left camera on lines, and their station;
-    `monochromator`: with one."""
+    `monochromator`: with one. `real_time_factor`: of the bench's clock."""
 
     def __init__(
         self,
@@ -47,8 +47,9 @@ class LampStation:
         concealed: Concealed | None = None,
         shape: tuple[int, int] = SHAPE,
         monochromator: bool = False,
+        real_time_factor: float = 0.0,
     ) -> None:
-        self.place = Bench(seed=3, concealed=concealed or {}, shape=shape, session_clock=time.time)
+        self.place = Bench(3, real_time_factor, concealed or {}, shape=shape, session_clock=time.time)
         self.lamp = MockPe4000(self.place)
         stop = threading.Event()
         running.callback(stop.set)
