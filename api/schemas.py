@@ -33,6 +33,7 @@ from lab.capture.records import RunRecord
 from lab.capture.session import Progress
 from lab.capture.station import Station
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
+from lab.engine import DEFAULT_ENGINE, Engine
 from lab.formats.importers import KINDS
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
 from lab.formats.results.diagnosis import DiagnosisVerdict
@@ -571,6 +572,11 @@ class RecordedCapture(Schema):
 RESOLVE_MINUTES = Field(
     default=None, gt=0, le=1e5, description="with `resolve`: lab time that its captures may take, min; null: any"
 )
+ENGINE = Field(
+    default=DEFAULT_ENGINE,
+    description="what diagnoses: `evidence`, one table of sets of effects with their posterior probabilities; `today`, "
+    "the engine before it",
+)
 RESOLVE_ROUNDS = Field(
     default=None, ge=1, le=100, description="with `resolve`: how many captures it takes at most; null: 6"
 )
@@ -595,6 +601,7 @@ class JobStart(Asked):
     )
     resolve_minutes: float | None = RESOLVE_MINUTES
     resolve_rounds: int | None = RESOLVE_ROUNDS
+    engine: Engine = ENGINE
     camera_model: str | None = Field(
         default=None,
         pattern=r"^[0-9a-f]{16}$",
@@ -621,6 +628,7 @@ class PipelineStart(CaptureStart):
     )
     resolve_minutes: float | None = RESOLVE_MINUTES
     resolve_rounds: int | None = RESOLVE_ROUNDS
+    engine: Engine = ENGINE
 
 
 class PipelineResults(Schema):

@@ -13,9 +13,11 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
+from lab.engine import DEFAULT_ENGINE, Engine
 from lab.errors import Cancelled, InputError
 from lab.shown import Displayable
 from sim.memory import return_freed_memory
@@ -101,6 +103,7 @@ class PipelineRequest:
     improved : the cameras with the effects that `diagnosis` names, by side, for the report; where none are given, those
     that are kept with it models : camera files that replace the fitted cameras, by side, in validation and diagnosis
     resolve : after the diagnosis, take the captures that tell the remaining rivals apart, within these limits; None: no
+    engine : which engine diagnoses
     station : the one that made `recordings` (`lab.resolve.station_of`), which takes these captures
     pictures : draw the residual pictures of the diagnosis
     bootstrap : healthy cameras that are drawn frame by frame for the threshold of the diagnosis
@@ -125,6 +128,7 @@ class PipelineRequest:
     pictures: bool = True
     bootstrap: int = 0
     workers: Workers | None = None
+    engine: Engine = DEFAULT_ENGINE
     report_file: Path | None = None
 
     def __post_init__(self) -> None:
@@ -395,7 +399,9 @@ class _Pipeline:
         if self.store.session(self._session).state != "finished":
             return None
         for found in self.store.results(self._session, kind):
-            if found.document.get("baseline") is None:  # of the fitted cameras, not of others that stood in for them
+            # of the fitted cameras, not of others that stood in for them, and by the engine that is asked for
+            is_by_another = self.request.engine != found.document.get("engine", "today")
+            if found.document.get("baseline") is None and not (kind == "diagnose" and is_by_another):
                 self._results[kind] = found.id
                 return model.model_validate(found.document)
         return None
@@ -483,6 +489,7 @@ class _Pipeline:
 
     def _diagnosed(self, recordings: RecordingSet, step: Step) -> Diagnosis:
         from lab.diagnose import examine
+        from lab.fit import FOR_DIAGNOSIS, fit_recording_set
 
         begun = 0.1 if step == "resolve" else 0.0
         found = examine(
@@ -494,6 +501,8 @@ class _Pipeline:
             bootstrap=self.request.bootstrap,
             workers=self.request.workers,
             station=self._station(),
+            engine=self.request.engine,
+            refit=partial(fit_recording_set, steps=FOR_DIAGNOSIS),
         )
         return replace(found, result=found.result.model_copy(update={"baseline": self._baseline}))
 

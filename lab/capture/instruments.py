@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from datetime import datetime
 from functools import partial
@@ -174,21 +174,12 @@ class Instruments:
     def _demands(self, steps: Sequence[Step]) -> Iterator[tuple[Callable[[], None], str]]:
         """Yield what is asked of the instruments without moving them, and, in words, where the plan's value comes
         from."""
-        limits = self.limits
         yield from self._light_demands(steps)
-        exposures: dict[tuple[str, float], None] = {}
-        for step in steps:
-            if isinstance(step.exposure, FixedExposure):
-                whence = f"the sequence {step.sequence} needs it, with gain_db under [limits] of the station file"
-                exposures[whence, step.exposure.exposure_s] = None
-            elif step.exposure is not None:
-                for key, exposure_s in (("min", limits.exposure_min_s), ("max", limits.exposure_max_s)):
-                    whence = f"exposure_{key}_s and gain_db under [limits] of the station file allow it: correct them"
-                    exposures[whence, exposure_s] = None
+        exposures = self._exposures(steps)
         for number, camera in enumerate(self.drivers.cameras.values()):
             yield partial(camera.check_trigger, "line" if number else "software"), ""
-            for whence, exposure_s in exposures:
-                yield partial(camera.check, exposure_s, limits.gain_db), whence
+            for whence, exposure_s, gain_db in exposures:
+                yield partial(camera.check, exposure_s, gain_db), whence
 
     def _light_demands(self, steps: Sequence[Step]) -> Iterator[tuple[Callable[[], None], str]]:
         """Yield the part of `_demands` that bears on the light."""
@@ -213,6 +204,22 @@ class Instruments:
             if self.lamp is not None:
                 whence = f"the sequence {sequence} needs it: give it another light, or leave it out"
                 yield partial(self.lamp.check, dict(channels)), whence
+
+    def _exposures(self, steps: Sequence[Step]) -> Iterable[tuple[str, float, float]]:
+        """Return every exposure (s) and gain (dB) of a plan, and in words where they come from."""
+        limits = self.limits
+        found: dict[tuple[str, float, float], None] = {}
+        for step in steps:
+            own_db = step.setting.gain_db
+            gain_db = limits.gain_db if own_db is None else own_db
+            gain = "gain_db under [limits] of the station file" if own_db is None else f"a gain of {own_db:g} dB"
+            if isinstance(step.exposure, FixedExposure):
+                found[f"the sequence {step.sequence} needs it, with {gain}", step.exposure.exposure_s, gain_db] = None
+            elif step.exposure is not None:
+                for key, exposure_s in (("min", limits.exposure_min_s), ("max", limits.exposure_max_s)):
+                    whence = f"exposure_{key}_s and {gain} allow it: correct them"
+                    found[whence, exposure_s, gain_db] = None
+        return found
 
     def _check_screen(self, target: str) -> None:
         """Raise DeviceError where the display's screen isn't as large as the station file has it: something scales its

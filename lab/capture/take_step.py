@@ -107,10 +107,10 @@ def _shoot(instruments: Instruments, shot: Shot) -> Plan[None]:
 
 
 def find_exposure(
-    wanted: FindExposure, instruments: Instruments, start_s: Mapping[Side, float]
+    wanted: FindExposure, instruments: Instruments, start_s: Mapping[Side, float], gain_db: float
 ) -> Plan[tuple[dict[Side, float], dict[Side, float]]]:
     """Search each camera's exposure (s) for the wanted level, with at most `TRIES` test frames that aren't kept.
-    Returns exposures and levels.
+    Returns exposures and levels. `gain_db`: of the cameras.
 
     After a saturated or unlit frame, the exposure is divided by 5 or multiplied by 10; after any other, it is
     multiplied by wanted level / level. Exposures stay within the station's limits. The last exposures are returned also
@@ -124,7 +124,7 @@ def find_exposure(
     levels: dict[Side, float] = {}
     before: tuple[dict[Side, float], dict[Side, float]] | None = None
     for _ in range(TRIES):
-        yield from _shoot(instruments, Shot(exposure_s, limits.gain_db, {}))
+        yield from _shoot(instruments, Shot(exposure_s, gain_db, {}))
         levels = dict(instruments.cameras.levels)
         following = dict(exposure_s)
         for side, level in levels.items():
@@ -208,13 +208,15 @@ def take(
     if photodiode is not None:
         yield from _measure_irradiance(photodiode, irradiance_nm(step))
     captures: tuple[Capture, ...] = ()
+    gain_db = instruments.limits.gain_db if step.setting.gain_db is None else step.setting.gain_db
     if isinstance(step.exposure, FindExposure):
-        exposure_s, levels = yield from find_exposure(step.exposure, instruments, _start(instruments, results))
+        start_s = _start(instruments, results)
+        exposure_s, levels = yield from find_exposure(step.exposure, instruments, start_s, gain_db)
         result |= {"exposure_s": exposure_s, "level": levels}
     elif step.exposure is not None:
         shot = Shot(
             _exposures(step, instruments, results),
-            instruments.limits.gain_db,
+            gain_db,
             {capture.side: capture.frame for capture in step.captures},
             repeats,
         )

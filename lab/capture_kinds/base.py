@@ -305,7 +305,8 @@ class Setting(Frozen):
 
     `wavelength_nm`: of the monochromator; 0 is zero order (white light), None keeps its shutter closed. `pattern`: path
     in the session of what the screen shows; None leaves the screen dark. `cell_px`: screen pixels per cell of the
-    pattern. `lamp`: share 0..1 by channel of the light source; what isn't named is dark."""
+    pattern. `gain_db`: of the cameras; None: the station's. `lamp`: share 0..1 by channel of the light source; what
+    isn't named is dark."""
 
     target: str | None
     wavelength_nm: float | None = None
@@ -313,6 +314,7 @@ class Setting(Frozen):
     pattern: str | None = None
     cell_px: int = 1
     by_hand: tuple[str, ...] = ()
+    gain_db: float | None = None
     lamp: dict[str, float] = {}
 
     @model_validator(mode="before")

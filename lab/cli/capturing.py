@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,8 +15,9 @@ from rich.markup import escape
 from lab.capture.data_folder import open_store, store_to_read
 from lab.cli.bench_process import mock_bench
 from lab.cli.console import check_writable, err, out, write_json
-from lab.cli.sources import Json, StoreFolder, recordings_of, run_here
+from lab.cli.sources import EngineName, Json, StoreFolder, recordings_of, run_here
 from lab.cli.tables import print_fit, print_resolving, print_sequences
+from lab.engine import DEFAULT_ENGINE
 from lab.errors import InputError
 from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult, capture_here
 
@@ -127,6 +129,7 @@ def run(
     ] = "",
     only: Only = None,
     parameters: Set = None,
+    engine: EngineName = DEFAULT_ENGINE,
     conceal: Conceal = None,
 ) -> None:
     """The main job: capture, fit, validate, diagnose, report. Without a station file: on the mock bench.
@@ -160,7 +163,9 @@ def run(
             name=name,
         )
         request = PipelineRequest("pipeline", capture=session, resolve=limits)
+    request = replace(request, engine=engine)
     verb = ["run"]  # what goes on then fits and diagnoses, too
+    verb += [] if engine == DEFAULT_ENGINE else [f"--engine={engine}"]
     verb += ["--resolve"] if resolve else []
     verb += [] if resolve_minutes is None else [f"--resolve-minutes={resolve_minutes:g}"]
     verb += [] if resolve_rounds is None else [f"--resolve-rounds={resolve_rounds}"]

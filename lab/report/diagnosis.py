@@ -52,6 +52,7 @@ def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[st
         return {}
     threshold = diagnosis.threshold
     return {
+        "by_table": diagnosis.engine == "evidence",
         "place_map": place_maps(diagnosis, sides),
         "discovered": [(law, _law_chart(law)) for law in diagnosis.discovered],
         "residual_pictures": [_ResidualImages.of(picture) for picture in diagnosis.pictures],

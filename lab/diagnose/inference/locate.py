@@ -45,9 +45,7 @@ class Slice:
 def chi2_by_slice(model: MeasurementModel, gaussian: Gaussian, policy: DecisionPolicy) -> list[Slice]:
     """Every slice of the seen numbers under a distribution of all numbers, most significant first."""
     residual = model.value - gaussian.mean
-    candidates: list[tuple[Observable, str, str, np.ndarray]] = []
-    for block, at in zip(model.blocks, model.slices, strict=True):
-        candidates += _slices(block, at, model.seen)
+    candidates = slices_of(model)
     found = []
     for block, axis, where, members in candidates:
         value = chi2(residual[members], gaussian.covariance[np.ix_(members, members)])
@@ -70,6 +68,14 @@ def log_tail(value: float, n: int) -> float:
     if exact > 0.0:
         return float(np.log(exact))
     return float(-0.5 * value + (0.5 * n - 1.0) * np.log(0.5 * value) - special.gammaln(0.5 * n))
+
+
+def slices_of(model: MeasurementModel) -> list[tuple[Observable, str, str, np.ndarray]]:
+    """Return every part of every measurement that is tested: its block, its axis, where it is in words, and the indices
+    of its used numbers."""
+    return [
+        part for block, at in zip(model.blocks, model.slices, strict=True) for part in _slices(block, at, model.seen)
+    ]
 
 
 def _slices(block: Observable, at: slice, seen: np.ndarray) -> list[tuple[Observable, str, str, np.ndarray]]:

@@ -3,8 +3,8 @@ covariance."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import constants
@@ -24,7 +24,6 @@ from lab.formats.recording_set import RecordingSet
 from lab.observables.noise.figures import BLACK_FLOOR_DN
 from lab.observables.noise.repeatability import LAMP_FLOOR
 from lab.observables.spectra.curves import CURVE_ROUGH_STD
-from lab.observables.spectra.narrowband import NARROWBAND_FLOOR
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.optics.imaging import DiffractionLimited
@@ -65,7 +64,8 @@ class Hypothesis:
 
     `displaced`: the same effects with the rival's parameters one posterior standard deviation away, a set for each
     principal direction of these; `beside`: those that act beside the rival; `law_std`: relative standard deviation of
-    what its law changes.
+    what its law changes. `law_stds`: by the name of an effect, relative standard deviation of what its law changes
+    beside the others.
     """
 
     name: str
@@ -74,6 +74,15 @@ class Hypothesis:
     displaced: tuple[tuple[Effect, ...], ...] = ()
     beside: tuple[Effect, ...] | None = None
     law_std: float = 0.0
+    law_stds: Mapping[str, float] = field(default_factory=dict)
+
+    def without(self) -> Iterator[tuple[tuple[Effect, ...], float]]:
+        """Yield the effects without one whose law may be wrong, and the relative standard deviation of its change."""
+        if self.beside is not None and self.law_std > 0.0:
+            yield self.beside, self.law_std
+        for name, std in self.law_stds.items():
+            if std > 0.0:
+                yield tuple(e for e in self.effects if e.name != name), std
 
 
 @dataclass(frozen=True)
@@ -93,8 +102,8 @@ class CandidateCapture:
         for h, own in zip(rivals, mean, strict=True):
             moved = [self.predict(replace(h, effects=effects)) - own for effects in h.displaced]
             jacobian.append(np.reshape(moved, (len(moved), -1)).T if moved else np.zeros((len(own), 0)))
-            without = None if h.beside is None or h.law_std == 0.0 else self.predict(replace(h, effects=h.beside))
-            law_error.append(np.zeros((len(own), 0)) if without is None else h.law_std * (own - without)[:, None])
+            wrong = [std * (own - self.predict(replace(h, effects=effects))) for effects, std in h.without()]
+            law_error.append(np.reshape(wrong, (len(wrong), -1)).T if wrong else np.zeros((len(own), 0)))
         return Forecast.of(mean, jacobian, law_error, self.covariance)
 
 
@@ -156,7 +165,7 @@ def _narrowband(camera: CameraModel) -> Iterator[CandidateCapture]:
 
         signal = predict(Hypothesis("", (), camera))
         noise = (signal + camera.read_noise_e**2) / (PIXELS * REPEATS)
-        floor = np.square(signal) * (NARROWBAND_FLOOR**2 + CURVE_ROUGH_STD**2)
+        floor = np.square(CURVE_ROUGH_STD * signal)
         around = {"from_nm": float(centre - 5.0), "to_nm": float(centre + 5.0), "step_nm": 2.5}
         yield CandidateCapture(
             f"narrowband light at {centre:g} nm",
@@ -332,7 +341,7 @@ def _colour_temperatures(camera: CameraModel, station: Equipment) -> Iterator[Ca
 
         mean = predict(Hypothesis("", (), camera))
         noise = (mean + camera.read_noise_e**2) / (PIXELS * REPEATS)
-        floor = np.square(mean) * (NARROWBAND_FLOOR**2 + CURVE_ROUGH_STD**2)
+        floor = np.square(CURVE_ROUGH_STD * mean)
         black = (BLACK_FLOOR_DN / camera.conversion_gain_dn_per_e) ** 2
         flats = FlatSequence(levels=(FILLED,), frames=REPEATS, lamp_level=1.0, colour_temperature_k=kelvin)
         yield CandidateCapture(

@@ -201,7 +201,7 @@ def detectability(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Itera
             effect=name,
             smallest={
                 told_as(field, library()[name].quantities()[field], gain_is_known=model.gain_is_known)[0]: size
-                for field, size in _smallest(library()[name], members, needed).items()
+                for field, size in smallest_sizes(library()[name], members, needed).items()
             },
             nearest=nearest,
             cosine=cosine,
@@ -209,7 +209,7 @@ def detectability(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Itera
         )
 
 
-def _smallest(
+def smallest_sizes(
     effect: type[Effect], members: list[tuple[tuple[Effect, ...], FloatArray]], needed: float
 ) -> dict[str, float]:
     """Parameter -> least departure from `absent` at which the non-centrality is `needed`. Empty for effects with

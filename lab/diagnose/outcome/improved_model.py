@@ -85,12 +85,12 @@ def improved_model(
     # electrons times gain are measured: where the fit has another gain, the curves take up the difference
     share = model.camera.conversion_gain_dn_per_e / camera.conversion_gain_dn_per_e
     curves = {
-        channel: _scaled(freed, share if freed is not curve else 1.0)
+        channel: scaled_curve(freed, share if freed is not curve else 1.0)
         for channel, curve in camera.quantum_efficiency.items()
         for freed in (freed_curve(curve, channel, estimates),)
     }
     corrections: list[Correction] = []
-    acting: list[Effect] = [*always, *(_nearest_form(e, estimates) for e in effects)]
+    acting: list[Effect] = [*always, *(nearest_form(e, estimates) for e in effects)]
     for one, (kind, why) in zip(discrepancies, applied, strict=True):
         block = model.blocks[one.index]
         name = block.measurement.title
@@ -102,16 +102,16 @@ def improved_model(
         fitted = model.fitted_mean(effects, kernels)[at]
         if kind == "noise":  # the camera keeps its gain: the correction holds what the fit moved that by, too
             stated = model.mean(effects)[at]
-            x, factor, each = _factor(block, fitted - stated, stated)
+            x, factor, each = factor_along(block, fitted - stated, stated)
         else:
-            x, factor, each = _factor(block, discrepancy[at], model.fitted_mean(effects)[at])
+            x, factor, each = factor_along(block, discrepancy[at], model.fitted_mean(effects)[at])
         if kind == "sensitivity":
             for channel, (wavelength_nm, by) in each.items():
                 if channel in curves:
-                    curves[channel] = _multiplied(curves[channel], wavelength_nm, by)
+                    curves[channel] = multiplied_curve(curves[channel], wavelength_nm, by)
             said = f"{name}: {IN_CURVES}, by wavelength and channel"
         else:
-            acting.append(_correction(kind, block, x, factor, camera))
+            acting.append(correction_on(kind, block, x, factor, camera))
             is_shared = one.grouping == "shared"
             said = f"{name}: a factor on the {kind}" + ("" if is_shared else f"; the mean of what goes {one.grouping}")
         corrections.append(Correction(block.measurement.name, kind, said))
@@ -126,7 +126,7 @@ def improved_model(
     return CameraFile(name, improved, tuple(acting), posterior=posterior, remarks=remarks), tuple(corrections)
 
 
-def _nearest_form(effect: Effect, estimates: Mapping[str, float]) -> Effect:
+def nearest_form(effect: Effect, estimates: Mapping[str, float]) -> Effect:
     """Return the effect by that form of its law whose coefficient in `estimates` is nearest to 1, if it is nearer to 1
     than to 0."""
     found = {number: estimates.get(form_name(effect, number), 0.0) for number in range(len(effect.other_forms()))}
@@ -142,7 +142,7 @@ def _applied(
     kernels: dict[int, FloatArray] = {}
     found: list[tuple[Applied | None, str]] = []
     for one in discrepancies:
-        kind = _place_for(model.blocks[one.index])
+        kind = place_for(model.blocks[one.index])
         if one.log_odds <= 0:
             found.append((None, "no smooth discrepancy describes it"))
         elif kind is None:
@@ -155,7 +155,7 @@ def _applied(
     return found, kernels
 
 
-def _place_for(block: Observable) -> Applied | None:
+def place_for(block: Observable) -> Applied | None:
     """Return the stage that a smooth factor along the measurement's axis can act on."""
     if block.measurement.places:
         return None
@@ -164,7 +164,7 @@ def _place_for(block: Observable) -> Applied | None:
     )
 
 
-def _factor(
+def factor_along(
     block: Observable, mean: FloatArray, predicted: FloatArray
 ) -> tuple[FloatArray, FloatArray, dict[str, tuple[FloatArray, FloatArray]]]:
     """x and the factor on the prediction there, averaged over channels and conditions; and the same by channel. `mean`:
@@ -185,7 +185,7 @@ def _factor(
     return places, factor, {str(c): along(usable & (channel == c)) for c in np.unique(channel[usable])}
 
 
-def _correction(
+def correction_on(
     kind: Applied, block: Observable, x: FloatArray, factor: FloatArray, camera: CameraModel
 ) -> ModelDiscrepancy:
     """Return the factor on its stage, in that stage's unit."""
@@ -209,13 +209,13 @@ def _of(
     return ModelDiscrepancy(along=along, at=tuple(x.tolist()), factor=tuple(factor.tolist()), strength=1.0)
 
 
-def _scaled(curve: Spectrum, factor: float) -> Spectrum:
+def scaled_curve(curve: Spectrum, factor: float) -> Spectrum:
     return (
         curve if factor == 1.0 else Spectrum.of(curve.wavelength_nm, np.clip(factor * np.array(curve.value), 0.0, 1.0))
     )
 
 
-def _multiplied(curve: Spectrum, at: FloatArray, factor: FloatArray) -> Spectrum:
+def multiplied_curve(curve: Spectrum, at: FloatArray, factor: FloatArray) -> Spectrum:
     """Return a curve times a factor that is held beyond its ends."""
     grid = np.union1d(np.array(curve.wavelength_nm), at)
     grid = grid[(grid >= curve.wavelength_nm[0]) & (grid <= curve.wavelength_nm[-1])]

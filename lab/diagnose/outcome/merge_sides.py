@@ -104,7 +104,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
             if quantity.dispensable and all(c.std.get(field) is None for c in candidates):
                 continue
             values_of_sides = [(float(getattr(c.effect, field)), c.std.get(field)) for c in candidates]
-            value, std = _mean(values_of_sides, is_shared="light" in kind.stages())
+            value, std = pooled(values_of_sides, is_shared="light" in kind.stages())
             told, unit = told_as(field, quantity, gain_is_known=bool(in_electrons))
             is_signed = all(field not in c.unsigned for c in candidates)
             interval = _interval(field, candidates)
@@ -117,7 +117,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
                 interval=interval,
                 is_determined=not is_size or is_determined(value, quantity.absent or 0.0, std, interval),
             )
-        chosen = [_choices(c.effect, c.alike) for c in candidates]
+        chosen = [choices_of(c.effect, c.alike) for c in candidates]
         choices = {
             field: " and ".join(dict.fromkeys(one[field] for one in chosen if field in one)) for field in chosen[0]
         }
@@ -135,14 +135,14 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
             values += "; sign unknown"
         modes = candidates[0].modes if len(candidates) == 1 else ()
         for mode in modes:
-            told = ", ".join(f"{_plain_name(f, parameters[f].unit)} {v:.3g}" for f, v in mode.items())
+            told = ", ".join(f"{plain_name(f, parameters[f].unit)} {v:.3g}" for f, v in mode.items())
             values += f"; {told} fits as well"
         sides = tuple(side for side, _ in members)
         is_exact = all(one.candidate.is_closed for _, one in members)
         corrections = tuple(dict.fromkeys(c for _, one in members for c in one.corrections))
         seen = f"Seen in {' and '.join(shown)} of the {' and '.join(sides)} camera"
         if held:
-            statement = _family_statement(kind.family, held, is_exact, seen, values, corrections)
+            statement = family_statement(kind.family, held, is_exact, seen, values, corrections)
         else:
             statement = f"{kind.sentence} {seen}: {values}."
         named.append(
@@ -167,7 +167,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
     return named
 
 
-def _choices(effect: Effect, alike: Sequence[Effect] = ()) -> dict[str, str]:
+def choices_of(effect: Effect, alike: Sequence[Effect] = ()) -> dict[str, str]:
     """Return which of its alternatives an effect is, by field; and those that the recordings don't tell from it."""
     told: dict[str, str] = {}
     for name in type(effect).told_choices():
@@ -186,7 +186,7 @@ def _members(candidates: Sequence[Candidate]) -> tuple[Member, ...]:
     return tuple(Member(name=n, probability=p) for n, p in sorted(total.items(), key=lambda item: -item[1]))
 
 
-def _family_statement(
+def family_statement(
     family: Family, members: Sequence[Member], is_exact: bool, seen: str, values: str, corrections: Sequence[str]
 ) -> str:
     """Return the sentences about a named family: how well its laws hold, which they are, and the capture that tells
@@ -208,14 +208,14 @@ def _family_statement(
     return " ".join(told)
 
 
-def _plain_name(field: str, unit: str) -> str:
+def plain_name(field: str, unit: str) -> str:
     """Return a parameter's name in words, without its unit."""
     return field.removesuffix("_" + unit.lower()).replace("_", " ")
 
 
 def _size(field: str, value: ParameterValue) -> str:
     """Return a parameter in words, with what its interval tells."""
-    text = f"{_plain_name(field, value.unit)} {measured(value.value, value.std, value.unit, value.interval)}"
+    text = f"{plain_name(field, value.unit)} {measured(value.value, value.std, value.unit, value.interval)}"
     return text if value.is_determined else f"{text}, not determined"
 
 
@@ -236,7 +236,7 @@ def _interval(field: str, candidates: Sequence[Candidate]) -> tuple[float, float
     return min(low for low, _ in ends), max(high for _, high in ends)
 
 
-def _mean(values: list[tuple[float, float | None]], is_shared: bool) -> tuple[float, float | None]:
+def pooled(values: list[tuple[float, float | None]], is_shared: bool) -> tuple[float, float | None]:
     """Mean of (value, standard deviation), weighted by 1 / variance; the first value where a standard deviation isn't
     known.
 

@@ -36,9 +36,10 @@ from lab.formats.results.plausible import FIGURES
 from lab.formats.results.words import measured
 from lab.observables.boards.residuals import BOARDS
 from lab.observables.boards.views import MIN_CORNERS
-from lab.observables.flats.linearity import PHOTON_TRANSFER, RADIOMETER_STD, misstated_levels
+from lab.observables.flats.linearity import PHOTON_TRANSFER, misstated_levels
 from lab.observables.gaussian import Gaussian, chi2
 from lab.observables.observable import Observable
+from lab.observables.spectra.light_readings import RADIOMETER_STD
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.empirical_law import EmpiricalLaw

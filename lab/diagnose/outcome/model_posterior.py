@@ -16,10 +16,11 @@ import numpy as np
 
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.refit import Coordinate, coordinate_prior, coordinates, moved, refit
+from lab.diagnose.inference.refit import refit
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior, NameInDoubt, RivalModel, StoredEffect
+from lab.inference.coordinates import EffectCoordinate, coordinate_prior, coordinates, moved
 from lab.observables.charts.chart import CHART
 from lab.observables.charts.patches import reflectance_covariance
 from lab.observables.flats.noise import GAIN_STD, NOISE
@@ -51,10 +52,12 @@ def model_posterior(
     discrepancies: Mapping[int, FloatArray] | None = None,
     gain_db: float = 0.0,
     is_corrected: bool = False,
+    disturbances: FloatArray | None = None,
 ) -> ModelPosterior | None:
     """Return the posterior of the parameters of `model` with `effects`, about `camera`, the improved model.
 
     discrepancies : covariances of model discrepancies by block, which stand beside the effects
+    disturbances : columns (n, r) of small physics, of unit variance, which are marginalised
     is_corrected : whether the improved model has a correction of the noise, which holds what gain and read noise were
     moved by gain_db : amplification for which the estimates of `model` hold
 
@@ -93,7 +96,8 @@ def model_posterior(
         for index, kernel in kernels.items():
             inside = seen[model.slices[index]]
             gaussian = gaussian.with_discrepancy(index, kernel[np.ix_(inside, inside)])
-        with_effects = np.column_stack([gaussian.shared_jacobian, by_effects * width])
+        small = np.zeros((int(seen.sum()), 0)) if disturbances is None else disturbances[seen]
+        with_effects = np.column_stack([gaussian.shared_jacobian, small, by_effects * width])
         gaussian = replace(gaussian, shared_jacobian=with_effects)
         white = gaussian.whiten(np.column_stack([jacobian, model.seen_value - gaussian.mean]))
         return white[:, :-1].T @ white[:, -1], prior - white[:, :-1].T @ white[:, :-1]
@@ -118,7 +122,11 @@ def lasting_means(
     model: MeasurementModel, effects: Sequence[Effect], discrepancies: Mapping[int, FloatArray]
 ) -> dict[str, float]:
     """Posterior means of the nuisance parameters that stay, and of the patches' reflectances, with other effects."""
-    weighted = model.weighted_residual(effects, discrepancies)
+    return lasting_means_of(model, effects, model.weighted_residual(effects, discrepancies))
+
+
+def lasting_means_of(model: MeasurementModel, effects: Sequence[Effect], weighted: FloatArray) -> dict[str, float]:
+    """Return the same, given the weighted residual C^-1 (y - m), (n,)."""
     found = {
         name: float(column @ weighted)
         for name, column in model.nuisance_jacobian(effects).items()
@@ -158,12 +166,14 @@ def with_unnamed(effects: Sequence[Effect], posterior: ModelPosterior) -> tuple[
     return (*effects, *(library()[name]() for name in more if name in library() and name not in there))
 
 
-def coordinate_name(effects: Sequence[Effect], coordinate: Coordinate) -> str:
+def coordinate_name(effects: Sequence[Effect], coordinate: EffectCoordinate) -> str:
     """Return how a posterior calls the parameter of an effect."""
     return f"{effects[coordinate.index].name}.{coordinate.name}"
 
 
-def effect_jacobian(model: MeasurementModel, effects: Sequence[Effect], coords: Sequence[Coordinate]) -> FloatArray:
+def effect_jacobian(
+    model: MeasurementModel, effects: Sequence[Effect], coords: Sequence[EffectCoordinate]
+) -> FloatArray:
     """Derivatives (n, p) of the predicted numbers by the coordinates of the effects' parameters, by differences within
     the bounds."""
     columns = [np.zeros((len(model.value), 0))]

@@ -26,11 +26,12 @@ from lab.diagnose.inference.refit import displaced, refit
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
-from lab.diagnose.outcome.expected_information import Forecast
+from lab.diagnose.outcome.expected_information import Forecast, settling_probability
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.visibility import visibility
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import NextCapture
+from lab.inference.posterior import NAMED
 from lab.observables.spectra.curves import freed_curve
 from sim.camera import Side
 from sim.effects.base import Effect
@@ -51,6 +52,10 @@ SETTLING: dict[str, tuple[str, str | None]] = {
     "field": ("the same captures at the corners of the field", LIT),
     "time": ("the same captures again, in the reverse order", None),
 }
+
+
+#: Between the effects of a rival that is a set of them.
+WITH = " with "
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,7 @@ class Doubt:
                     rivals=(self.rivals[one], self.rivals[other]),
                     distance=distance,
                     told_apart=float(ndtr(np.sqrt(0.5 * distance))),
+                    settles=round(settling_probability([capture.forecast], self.odds, NAMED), 3),
                 )
             )
         found.sort(key=lambda item: -item.distance)
@@ -176,15 +182,21 @@ def next_sentence(found: Sequence[NextCapture], settling: str | None, policy: De
         f"no capture that can be predicted tells {one} from {other} by more than {np.sqrt(2.0 * best.distance):.1f} "
         "standard deviations"
     )
-    differs = library()[one].invariances ^ library()[other].invariances
+    steady_by = {name: _invariances(name) for name in (one, other)}
     for thing, (capture, kind) in SETTLING.items():
-        if thing in differs:
-            steady, moving = (one, other) if thing in library()[one].invariances else (other, one)
-            if _shows_in(moving, kind):
+        if thing in steady_by[one] ^ steady_by[other]:
+            steady, moving = (one, other) if thing in steady_by[one] else (other, one)
+            if any(_shows_in(effect, kind) for effect in moving.split(WITH)):
                 return (
                     f"{capture[0].upper()}{capture[1:]} may tell them apart ({beyond}): only {steady} stays the same."
                 )
     return f"{beyond[0].upper()}{beyond[1:]}: both depend on the same things."
+
+
+def _invariances(rival: str) -> frozenset[str]:
+    """Return what none of a rival's effects depends on; of a rival without effects, everything."""
+    kinds = [library()[name] for name in rival.split(WITH) if name in library()]
+    return frozenset(SETTLING).intersection(*(kind.invariances for kind in kinds))
 
 
 def _shows_in(effect: str, kind: str | None) -> bool:

@@ -13,13 +13,13 @@ from lab.diagnose.inference.refit import (
     _standard_deviations,
     _wide_residual,
     _wide_slope,
-    coordinates,
     is_of_usual_size,
     profile_interval,
     refit,
     size_covariance,
 )
 from lab.diagnose.policy import DecisionPolicy
+from lab.inference.coordinates import coordinates
 from lab.observables.observable import Label, Observable, Prediction
 from sim.effects.base import Effect
 from sim.effects.library import effect

@@ -10,7 +10,7 @@ import pytest
 from pydantic import Field
 
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.outcome.merge_sides import _choices, merged
+from lab.diagnose.outcome.merge_sides import choices_of, merged
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
 from lab.formats.results import Combination, DiagnosisLists, DiagnosisResult, NamedEffect, ParameterValue
@@ -32,17 +32,17 @@ class _Rows(Effect):
 
 def test_the_choices_of_a_law_are_its_alternatives_and_no_seeds() -> None:
     glow = effect("amplifier_glow")(glow_e_per_s=3.0, corner="bottom_right")
-    assert _choices(glow) == {"corner": "bottom_right"}
-    assert _choices(effect("row_noise")(noise_e=3.0, pattern_seed=4)) == {}
-    assert _choices(effect("optical_low_pass_filter")(displacement_x_um=2.0)) == {}
+    assert choices_of(glow) == {"corner": "bottom_right"}
+    assert choices_of(effect("row_noise")(noise_e=3.0, pattern_seed=4)) == {}
+    assert choices_of(effect("optical_low_pass_filter")(displacement_x_um=2.0)) == {}
 
 
 def test_integers_with_bounds_are_told_and_all_that_are_alike() -> None:
     """A period among listed numbers, and a row; what the recordings can't tell from them stands beside them."""
     found = _Rows(first_row=3, seed=5)
-    assert _choices(found) == {"period": "8", "first_row": "3"}
+    assert choices_of(found) == {"period": "8", "first_row": "3"}
     alike = (_Rows(first_row=1), _Rows(first_row=3, period=4))
-    assert _choices(found, alike) == {"period": "8 or 4", "first_row": "3 or 1"}
+    assert choices_of(found, alike) == {"period": "8 or 4", "first_row": "3 or 1"}
 
 
 def test_a_finding_says_which_alternative_it_is() -> None:
