@@ -19,12 +19,14 @@ from scipy import special
 
 from lab.diagnose.evidence.causes import LEAST_LISTED, Cause
 from lab.diagnose.evidence.side import DRAWS, FALSE_ALARM_RATE, EvidenceFindings
+from lab.diagnose.outcome.determined import combination_words, combinations_of
 from lab.diagnose.outcome.goodness_of_fit import told_as
 from lab.diagnose.outcome.merge_sides import LEAST_CAPTURES, choices_of, family_statement, plain_name, pooled
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DEFAULT_POLICY
 from lab.effect_titles import effect_title
 from lab.formats.results import (
+    Combination,
     DiagnosisLists,
     DiagnosisResult,
     DiagnosisVerdict,
@@ -178,6 +180,12 @@ def _entry(one: _Named, found: Sequence[EvidenceFindings]) -> NamedEffect:
             interval=size.interval if len(alike) == 1 else (value - 1.96 * (std or 0.0), value + 1.96 * (std or 0.0)),
             is_determined=any(s.is_determined for s in sizes),
         )
+    combined = tuple(
+        combination
+        for side, cause in zip(one.sides, one.causes, strict=True)
+        if cause.kind is kind
+        for combination in _combinations(side, cause, gain_is_known)
+    )
     choices = choices_of(first.effect, first.alike)
     shown_in = tuple(dict.fromkeys(name for cause in one.causes for name in cause.shown_in))
     rest = (1.0 - one.probability) / max(1.0 - first.probability, 1e-15)
@@ -192,19 +200,30 @@ def _entry(one: _Named, found: Sequence[EvidenceFindings]) -> NamedEffect:
         probability=one.probability,
         sides=one.sides,
         parameters=parameters,
+        combinations=combined,
         choices=choices,
         modes=first.modes if len(alike) == 1 else (),
         shown_in=shown_in,
         rivals=tuple(Rival(name=n, probability=p) for n, p in rivals if p >= LEAST_LISTED),
-        statement=_statement(one, first, parameters, choices, shown_in, members, is_exact),
+        statement=_statement(one, first, parameters, combined, choices, shown_in, members, is_exact),
         reference=kind.reference,
     )
+
+
+def _combinations(side: Side, cause: Cause, gain_is_known: bool) -> tuple[Combination, ...]:
+    """Return what one side determines of a cause's sizes that it can't tell apart."""
+    quantities = cause.kind.quantities()
+    every = [(size.parameter, quantities[size.parameter]) for size in cause.sizes]
+    own = [k for k, (name, q) in enumerate(every) if q.absent is not None and name not in cause.kind.shapes]
+    covariance = cause.covariance[np.ix_(own, own)]
+    return combinations_of(side, [every[k] for k in own], cause.mean[own], covariance, gain_is_known=gain_is_known)
 
 
 def _statement(
     one: _Named,
     first: Cause,
     parameters: dict[str, ParameterValue],
+    combined: Sequence[Combination],
     choices: dict[str, str],
     shown_in: Sequence[str],
     members: Sequence[Member],
@@ -213,6 +232,7 @@ def _statement(
     """Return a named cause as a sentence: what physics was left out, how that shows, and its size."""
     kind = first.kind
     sizes = [_size(field, p) for field, p in parameters.items()]
+    sizes += [combination_words(c) for c in combined]
     sizes += [f"{field} {value}".replace("_", " ") for field, value in choices.items()]
     values = ", ".join(sizes)
     if any(not p.sign_known for p in parameters.values()):

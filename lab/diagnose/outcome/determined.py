@@ -17,8 +17,10 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import size_covariance
 from lab.diagnose.outcome.goodness_of_fit import told_as
 from lab.formats.results import Combination
+from lab.formats.results.words import measured
 from sim.camera import Side
 from sim.effects.base import Effect
+from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
 #: Partial correlation of two coordinates from which they can't be told apart: each alone then has more than twice the
@@ -95,12 +97,31 @@ def combinations(
     if effect not in effects:
         return ()
     coords, from_absence, covariance = size_covariance(model, effects, effects.index(effect))
+    named = [(c.name, c.quantity) for c in coords]
+    return combinations_of(side, named, from_absence, covariance, gain_is_known=model.gain_is_known)
+
+
+def combinations_of(
+    side: Side,
+    parameters: Sequence[tuple[str, Quantity]],
+    from_absence: FloatArray,
+    covariance: FloatArray,
+    *,
+    gain_is_known: bool,
+) -> tuple[Combination, ...]:
+    """Return what is determined of an effect's sizes that can't be told apart.
+
+    parameters : name and quantity of each size
+    from_absence : of each, sign(p - absent) |p - absent|^linear_power, (k,)
+    covariance : theirs (k, k)
+    """
     found = []
-    for power in sorted({int(c.quantity.linear_power) for c in coords if not c.quantity.logarithmic}):
-        own = [k for k, c in enumerate(coords) if c.quantity.linear_power == power and not c.quantity.logarithmic]
+    linear = [k for k, (_, quantity) in enumerate(parameters) if not quantity.logarithmic]
+    for power in sorted({int(parameters[k][1].linear_power) for k in linear}):
+        own = [k for k in linear if parameters[k][1].linear_power == power]
         for one in determined_directions(from_absence[own], covariance[np.ix_(own, own)]):
-            members = [coords[own[k]] for k in one.members]
-            told = [told_as(c.name, c.quantity, gain_is_known=model.gain_is_known) for c in members]
+            members = [parameters[own[k]] for k in one.members]
+            told = [told_as(name, quantity, gain_is_known=gain_is_known) for name, quantity in members]
             found.append(
                 Combination(
                     side=side,
@@ -113,6 +134,12 @@ def combinations(
                 )
             )
     return tuple(found)
+
+
+def combination_words(one: Combination) -> str:
+    """Return in words what the recordings determine of parameters that they can't tell apart."""
+    names = [f"{name}^{one.power}" if one.power > 1 else name for name in one.parameters]
+    return f"{sum_words(names, one.weights)} = {measured(one.value, one.std, one.unit)} is, of the {one.side} camera"
 
 
 def _raised(unit: str, power: int) -> str:

@@ -8,14 +8,13 @@ import numpy as np
 from scipy import special
 
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.outcome.determined import is_determined, sum_words
+from lab.diagnose.outcome.determined import combination_words, is_determined
 from lab.diagnose.outcome.goodness_of_fit import set_sentences, told_as
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
 from lab.effect_titles import effect_title
 from lab.formats.results import (
-    Combination,
     DiagnosisLists,
     DiagnosisResult,
     DiagnosisVerdict,
@@ -127,7 +126,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
         values = ", ".join(
             (
                 *(_size(f, p) for f, p in parameters.items()),
-                *(_combined(c) for c in combined),
+                *(combination_words(c) for c in combined),
                 *(f"{f} {value}".replace("_", " ") for f, value in choices.items()),
             )
         )
@@ -217,12 +216,6 @@ def _size(field: str, value: ParameterValue) -> str:
     """Return a parameter in words, with what its interval tells."""
     text = f"{plain_name(field, value.unit)} {measured(value.value, value.std, value.unit, value.interval)}"
     return text if value.is_determined else f"{text}, not determined"
-
-
-def _combined(one: Combination) -> str:
-    """Return in words what the recordings determine of parameters that they can't tell apart."""
-    names = [f"{name}^{one.power}" if one.power > 1 else name for name in one.parameters]
-    return f"{sum_words(names, one.weights)} = {measured(one.value, one.std, one.unit)} is, of the {one.side} camera"
 
 
 def _interval(field: str, candidates: Sequence[Candidate]) -> tuple[float, float] | None:
