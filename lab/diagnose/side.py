@@ -43,8 +43,9 @@ from lab.diagnose.outcome.mismatches import (
     vetoed_names,
     with_laws,
 )
-from lab.diagnose.outcome.model_posterior import names_in_doubt
-from lab.diagnose.outcome.next_capture import Doubt, doubt_of
+from lab.diagnose.outcome.names_in_doubt import names_in_doubt
+from lab.diagnose.outcome.next_capture import Doubt
+from lab.diagnose.outcome.rivals_in_doubt import doubt_of
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
