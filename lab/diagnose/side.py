@@ -19,6 +19,7 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.side_model import dataset_of, measurement_model
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.metadata import misstatements, unchecked
+from lab.diagnose.metadata.stated_light import impossible_efficiency, misstated_light
 from lab.diagnose.outcome.goodness_of_fit import (
     detectability,
     held_out,
@@ -27,17 +28,15 @@ from lab.diagnose.outcome.goodness_of_fit import (
     residual_curves,
     side_models,
 )
-from lab.diagnose.outcome.improved_model import improved_model, residual_pictures
+from lab.diagnose.outcome.improved_model import improved_model
 from lab.diagnose.outcome.mismatches import (
     board_departure,
     corrected_by_laws,
     described,
     family_corrections,
-    impossible_efficiency,
     in_light_of_laws,
     left_to_smooth,
     located,
-    misstated_light,
     shown_in,
     unexplained,
     vetoed_names,
@@ -45,6 +44,7 @@ from lab.diagnose.outcome.mismatches import (
 )
 from lab.diagnose.outcome.names_in_doubt import names_in_doubt
 from lab.diagnose.outcome.next_capture import Doubt
+from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.outcome.rivals_in_doubt import doubt_of
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy

@@ -10,7 +10,7 @@ import numpy as np
 from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.evidence.causes import NOTHING, Cause
 from lab.diagnose.evidence.side_table import SideTable, posterior_means, weighted_residual
-from lab.diagnose.outcome.improved_model import (
+from lab.diagnose.outcome.corrections import (
     Applied,
     Correction,
     correction_on,

@@ -19,8 +19,8 @@ from scipy import special
 
 from lab.diagnose.evidence.causes import LEAST_LISTED, Cause
 from lab.diagnose.evidence.side import DRAWS, FALSE_ALARM_RATE, EvidenceFindings
-from lab.diagnose.outcome.goodness_of_fit import told_as
-from lab.diagnose.outcome.merge_sides import LEAST_CAPTURES, choices_of, family_statement, plain_name, pooled
+from lab.diagnose.outcome.detectability import told_as
+from lab.diagnose.outcome.named_in_words import LEAST_CAPTURES, choices_of, family_statement, plain_name, pooled
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DEFAULT_POLICY
 from lab.effect_titles import effect_title
