@@ -170,6 +170,7 @@ SIZES: dict[str, str] = {
     "image_lag": "left:lag_percent=2",
     "infrared_cut_filter": "left:cut_wavelength_nm=655,width_nm=4",
     "inter_pixel_capacitance": "left:share_percent=2",
+    "lamp_ageing": "both:reddening_percent=12",
     "lateral_chromatic_aberration": "left:slope_um=2.5",
     "light_flicker": "both:modulation_percent=8,frequency_hz=100,line_time_us=20",
     "microlens_angle": "left:crosstalk_percent=3,loss_percent=4",

@@ -24,6 +24,7 @@ from scipy.stats import kstest
 
 from evaluation.draw import draw
 from evaluation.own_chain import healthy_session
+from evaluation.rig_errors import RigErrors
 from lab.diagnose.inference.side_model import measurement_model
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet
@@ -41,8 +42,9 @@ CHANCE = 0.01
 
 
 def of_second_simulator(number: int) -> RecordingSet:
-    """Return healthy set `number` of the second simulator."""
-    return draw(SEED, number, "small" if number % 2 else "medium", kind="healthy", sizing="unmeasured").recordings
+    """Return healthy set `number` of the second simulator, of a rig within its tolerances."""
+    size = "small" if number % 2 else "medium"
+    return draw(SEED, number, size, kind="healthy", sizing="unmeasured", rig=RigErrors(SEED, number)).recordings
 
 
 #: Healthy sets by the simulator that draws them.

@@ -476,7 +476,8 @@ class Charge(State):
             frequency = np.asarray(np.fft.fftfreq(tile.shape[law.axis]), float)
             along = law.otf(frequency, frequency, transfers)
             shaped = along[:, None] if law.axis == 0 else along[None, :]
-            tile = law.steady_share * np.real(np.fft.ifft(np.fft.fft(tile, axis=law.axis) * shaped, axis=law.axis))
+            found = np.real(np.fft.ifft(np.fft.fft(tile, axis=law.axis) * shaped, axis=law.axis))
+            tile = law.steady_share(transfers) * found
         return tile
 
     def multiplication(self, gain_db: float) -> Multiplication:

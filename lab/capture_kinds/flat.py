@@ -22,6 +22,7 @@ from lab.capture_kinds.base import (
     spectrum_path,
 )
 from lab.capture_kinds.irradiance import IrradianceCapture
+from lab.capture_kinds.lamp import LAMP_INSTRUMENTS, ColourTemperature, LampLevel, check_lamp, lamp_channels, lamp_words
 from sim.parameters import Quantity
 from sim.scene.scenes import Scene, UniformField
 from sim.spectrum import Spectrum
@@ -48,7 +49,11 @@ class FlatSequence(Sequence):
     Each camera has exposures of its own, scaled from that found for `level_found`. The series of levels is taken
     upwards and downwards in turn. The radiance is measured before each turn, so that a drift of the lamp shows as a
     difference between turns. `wavelength_nm`: of the light, 0 is white; with one wavelength a photodiode measures the
-    irradiance before each frame (EMVA 1288)."""
+    irradiance before each frame (EMVA 1288). `gains_db`: further gains of the cameras at which the whole is taken
+    again, with exposures found anew: with the gain of a multiplying register its excess noise changes, while that of
+    an amplifier keeps the shot noise of electrons. With a `lamp_level` above 0 the light source lights the sphere in
+    place of the monochromator: its light of `colour_temperature_k`, or of `wavelength_nm`, else the first of the
+    station file."""
 
     name: ClassVar[str] = "flat"
     purpose: ClassVar[str] = "conversion gain, PRNU, full well, linearity (photon transfer)"
@@ -61,38 +66,55 @@ class FlatSequence(Sequence):
     frames: Annotated[int, Quantity("1", "frames at each level", lower=1, upper=20_000)]
     level_found: Level = 0.75
     wavelength_nm: Annotated[float, Quantity("nm", "wavelength of the light; 0: white", lower=0.0, upper=5000.0)] = 0.0
+    gains_db: Annotated[
+        tuple[float, ...], Quantity("dB", "further gains at which flats are taken", lower=-40.0, upper=80.0)
+    ] = Field(default=(), max_length=20)
+    lamp_level: LampLevel = 0.0
+    colour_temperature_k: ColourTemperature = None
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:
-        check_number(len(self.levels) * self.frames)
+        check_lamp(self.lamp_level, self.colour_temperature_k)
+        check_number(len(self.levels) * self.frames * (1 + len(self.gains_db)))
         return self
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
-        if station.lacks(*cls.instruments):
-            return None
         levels = QUICK_LEVELS if quick else LEVELS
+        if station.lacks(*cls.instruments):
+            return None if station.lacks(*LAMP_INSTRUMENTS) else cls(levels=levels, frames=4, lamp_level=1.0)
         return cls(levels=levels, frames=4, wavelength_nm=station.limits.flat_wavelength_nm or 0.0)
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
-        self.check_instruments(station)
-        slit_um = station.limits.slit_um if self.wavelength_nm else None
-        lit = Setting(target=station.one(SphereTarget), wavelength_nm=self.wavelength_nm, slit_um=slit_um)
-        stem = f"flat/{self.wavelength_nm:g}nm" if self.wavelength_nm else "flat"
-        found = exposure_step(stem, "flat field", lit, self.level_found, measures_light=False)
+        self.check_instruments(station, LAMP_INSTRUMENTS if self.lamp_level else None)
+        gains: tuple[float | None, ...] = (None, *self.gains_db)
+        return tuple(step for gain_db in gains for step in self._series(station, gain_db))
+
+    def _series(self, station: Equipment, gain_db: float | None) -> list[Step]:
+        """Return the steps of all levels at one gain; None: the station's."""
+        stem, what = f"flat/{self.wavelength_nm:g}nm" if self.wavelength_nm else "flat", "flat field"
+        sphere = station.one(SphereTarget)
+        if self.lamp_level:
+            channels = lamp_channels(station, self.lamp_level, self.colour_temperature_k, self.wavelength_nm)
+            lit = Setting(target=sphere, lamp=channels, gain_db=gain_db)
+            stem = f"{stem}/{lamp_words(self.lamp_level, self.colour_temperature_k)}"
+        else:
+            slit_um = station.limits.slit_um if self.wavelength_nm else None
+            lit = Setting(target=sphere, wavelength_nm=self.wavelength_nm, slit_um=slit_um, gain_db=gain_db)
+        if gain_db is not None:
+            stem, what = f"{stem}/{gain_db:g}dB", f"{what} at {gain_db:g} dB"
+        found = exposure_step(stem, what, lit, self.level_found, measures_light=False)
         made = [found]
         for frame in range(1, self.frames + 1):
             light = f"{stem}/light/{frame}"
-            made.append(
-                Step(id=light, what="flat field: measuring the light", setting=lit, radiance=spectrum_path(light))
-            )
+            made.append(Step(id=light, what=f"{what}: measuring the light", setting=lit, radiance=spectrum_path(light)))
             numbered = list(enumerate(self.levels, start=1))
             for number, level in numbered if frame % 2 else numbered[::-1]:
                 id = f"{stem}/level-{number:02d}/{frame}"
                 made.append(
                     Step(
                         id=id,
-                        what=f"flat field, level {number} of {len(self.levels)}, frame {frame} of {self.frames}",
+                        what=f"{what}, level {number} of {len(self.levels)}, frame {frame} of {self.frames}",
                         setting=lit,
                         exposure=RelativeExposure(of=found.id, factor=level / self.level_found),
                         captures=tuple(
@@ -100,13 +122,14 @@ class FlatSequence(Sequence):
                                 kind="flat",
                                 radiance=spectrum_path(light),
                                 wavelength_nm=self.wavelength_nm or None,
+                                colour_temperature_k=self.colour_temperature_k,
                                 **planned_keys(id, side),
                             )
                             for side in station.sides
                         ),
                     )
                 )
-        return tuple(made)
+        return made
 
 
 class FlatCapture(IrradianceCapture):

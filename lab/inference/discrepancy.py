@@ -20,7 +20,7 @@ from lab.observables.dataset import Dataset
 from lab.observables.observable import Observable
 from sim.effects.base import Effect
 from sim.effects.empirical_law import PLACES, Along, EmpiricalLaw, Of, Stage
-from sim.effects.transfer_discrepancy import TransferDiscrepancy
+from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.spectrum import FloatArray
 
 #: Change of a node for the differences: small, so that they are derivatives; of factors 1 %.
@@ -197,9 +197,10 @@ def _curve(
 
 def _directed(shape: str, at: Sequence[float]) -> _SmoothChange:
     def law(k: int, value: float) -> Effect:
-        change = [0.0] * len(at)
-        change[k] = value
-        return TransferDiscrepancy(shape=shape, at=tuple(at), change=tuple(change), strength=1.0)  # type: ignore[arg-type]
+        factor = [1.0] * len(at)
+        factor[k] += value
+        curve = {"at": tuple(at), "factor": tuple(factor), "strength": 1.0}
+        return ModelDiscrepancy.model_validate({"along": f"{shape}_frequency_cy_per_um"} | curve)
 
     return _SmoothChange(law, len(at), first=1)
 

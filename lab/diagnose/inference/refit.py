@@ -342,6 +342,33 @@ def _covariance(
     return np.linalg.pinv(curvature / np.outer(size, size)) / np.outer(size, size), told
 
 
+def size_covariance(
+    model: MeasurementModel, effects: Effects, index: int
+) -> tuple[list[EffectCoordinate], FloatArray, FloatArray]:
+    """Return the coordinates that size member `index`, theirs less those of absence (k,), and their posterior
+    covariance (k, k), that of its shapes and of the other members marginalised."""
+    coords = coordinates(effects, model.camera)
+    own = [k for k, c in enumerate(coords) if c.index == index and c.name not in type(effects[index]).shapes]
+    if not own:
+        return [], np.zeros(0), np.zeros((0, 0))
+    u, covariance, told = _posterior_covariance(model, effects, coords)
+    own = [k for k in own if told[k] and coords[k].quantity.absent is not None]
+    absent = np.array([coords[k].to_u(coords[k].absent) for k in own])
+    return [coords[k] for k in own], u[own] - absent, covariance[np.ix_(own, own)]
+
+
+def _posterior_covariance(
+    model: MeasurementModel, effects: Effects, coords: Sequence[EffectCoordinate]
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Coordinates (p,), their posterior covariance (p, p), and which of them anything bounds (p,)."""
+    u = np.array([c.to_u(float(getattr(effects[c.index], c.name))) for c in coords])
+    typical = np.array([c.typical(float(getattr(effects[c.index], c.name))) for c in coords])
+    high = np.array([c.bounds[1] for c in coords])
+    jacobian = _prediction_jacobian(model, effects, coords, u, typical, high)[model.seen]
+    covariance, told = _covariance(model.seen_gaussian(effects).whiten(jacobian), coords, coordinate_prior(coords)[1])
+    return u, covariance, told
+
+
 def displaced(model: MeasurementModel, effects: Effects, index: int) -> list[tuple[Effect, ...]]:
     """Return the effects with member `index` moved by one standard deviation along each principal direction of its
     parameters' posterior, within bounds: a set for each direction. Predictions by these, less that by `effects`, are a
@@ -350,12 +377,9 @@ def displaced(model: MeasurementModel, effects: Effects, index: int) -> list[tup
     own = [k for k, c in enumerate(coords) if c.index == index]
     if not own:
         return []
-    u = np.array([c.to_u(float(getattr(effects[c.index], c.name))) for c in coords])
+    u, covariance, told = _posterior_covariance(model, effects, coords)
     low, high = (np.array(b) for b in zip(*(c.bounds for c in coords), strict=True))
-    typical = np.array([c.typical(float(getattr(effects[c.index], c.name))) for c in coords])
-    jacobian = _prediction_jacobian(model, effects, coords, u, typical, high)[model.seen]
-    covariance, told = _covariance(model.seen_gaussian(effects).whiten(jacobian), coords, coordinate_prior(coords)[1])
-    scale = typical[own]
+    scale = np.array([c.typical(float(getattr(effects[c.index], c.name))) for c in coords])[own]
     size, direction = np.linalg.eigh(covariance[np.ix_(own, own)] / np.outer(scale, scale))
     found = []
     for part in (direction * np.sqrt(np.maximum(size, 0.0))).T:

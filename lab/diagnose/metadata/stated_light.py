@@ -9,7 +9,8 @@ from lab.formats.results import (
 )
 from lab.formats.results.plausible import FIGURES
 from lab.formats.results.words import measured
-from lab.observables.flats.linearity import PHOTON_TRANSFER, RADIOMETER_STD, misstated_levels
+from lab.observables.flats.linearity import PHOTON_TRANSFER, misstated_levels
+from lab.observables.spectra.light_readings import RADIOMETER_STD
 from sim.camera import Side
 
 

@@ -8,8 +8,16 @@ from scipy import special
 
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.outcome.detectability import told_as
+from lab.diagnose.outcome.determined import is_determined
 from lab.diagnose.outcome.goodness_of_fit import set_sentences
-from lab.diagnose.outcome.named_in_words import LEAST_CAPTURES, choices_of, family_statement, plain_name, pooled
+from lab.diagnose.outcome.named_in_words import (
+    LEAST_CAPTURES,
+    choices_of,
+    combination_in_words,
+    family_statement,
+    plain_name,
+    pooled,
+)
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
@@ -96,21 +104,26 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
             told, unit = told_as(field, quantity, gain_is_known=bool(in_electrons))
             is_signed = all(field not in c.unsigned for c in candidates)
             interval = _interval(field, candidates)
+            is_size = quantity.absent is not None and field not in kind.shapes
             parameters[told] = ParameterValue(
-                value=value, std=None if interval else std, unit=unit, sign_known=is_signed, interval=interval
+                value=value,
+                std=None if interval else std,
+                unit=unit,
+                sign_known=is_signed,
+                interval=interval,
+                is_determined=not is_size or is_determined(value, quantity.absent or 0.0, std, interval),
             )
         chosen = [choices_of(c.effect, c.alike) for c in candidates]
         choices = {
             field: " and ".join(dict.fromkeys(one[field] for one in chosen if field in one)) for field in chosen[0]
         }
+        combined = tuple(c for _, one in members if one.candidate in candidates for c in one.combinations)
         shown_in = tuple(dict.fromkeys(measurement for _, one in members for measurement in one.shown_in))
         shown = sorted({measurement_title(measurement) for measurement in shown_in})
         values = ", ".join(
             (
-                *(
-                    f"{plain_name(f, p.unit)} {measured(p.value, p.std, p.unit, p.interval)}"
-                    for f, p in parameters.items()
-                ),
+                *(_size(f, p) for f, p in parameters.items()),
+                *(combination_in_words(c) for c in combined),
                 *(f"{f} {value}".replace("_", " ") for f, value in choices.items()),
             )
         )
@@ -137,6 +150,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
                 probability=min(one.candidate.probability for _, one in members),
                 sides=sides,
                 parameters=parameters,
+                combinations=combined,
                 choices=choices,
                 modes=modes,
                 shown_in=shown_in,
@@ -156,6 +170,12 @@ def _members(candidates: Sequence[Candidate]) -> tuple[Member, ...]:
         for name, probability in candidate.members:
             total[name] = total.get(name, 0.0) + probability / len(candidates)
     return tuple(Member(name=n, probability=p) for n, p in sorted(total.items(), key=lambda item: -item[1]))
+
+
+def _size(field: str, value: ParameterValue) -> str:
+    """Return a parameter in words, with what its interval tells."""
+    text = f"{plain_name(field, value.unit)} {measured(value.value, value.std, value.unit, value.interval)}"
+    return text if value.is_determined else f"{text}, not determined"
 
 
 def _interval(field: str, candidates: Sequence[Candidate]) -> tuple[float, float] | None:

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from lab.effect_titles import effect_title
-from lab.formats.results import Member
+from lab.formats.results import Combination, Member
+from lab.formats.results.words import measured
 from sim.effects.base import Effect
 from sim.effects.families import Family
 
@@ -71,3 +72,18 @@ def pooled(values: list[tuple[float, float | None]], is_shared: bool) -> tuple[f
     std = np.array([s for _, s in known])
     mean = float(np.sum(weight * np.array([v for v, _ in known])) / weight.sum())
     return mean, float(np.sum(weight * std) / weight.sum() if is_shared else 1.0 / np.sqrt(weight.sum()))
+
+
+def combination_in_words(one: Combination) -> str:
+    """Return in words what the recordings determine of parameters that they can't tell apart."""
+    names = [f"{name}^{one.power}" if one.power > 1 else name for name in one.parameters]
+    return f"{sum_words(names, one.weights)} = {measured(one.value, one.std, one.unit)} is, of the {one.side} camera"
+
+
+def sum_words(names: Sequence[str], weights: Sequence[float]) -> str:
+    """Return a combination as a formula: `a + 0.52 b - 2 c`."""
+    text = names[0]
+    for name, weight in zip(names[1:], weights[1:], strict=True):
+        size = f"{abs(weight):.2g}"
+        text += f" {'-' if weight < 0.0 else '+'} {'' if size == '1' else f'{size} '}{name}"
+    return text

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from lab.engine import Engine
+from lab.formats.results.estimate import Estimate
 from lab.formats.results.fit import Skipped
 from lab.shown import Tabular
 from sim.camera import Side
@@ -31,7 +32,7 @@ class Mismatch(Frozen):
     captures: tuple[str, ...]
 
 
-class ParameterValue(Frozen):
+class ParameterValue(Estimate):
     """An estimated parameter of an effect.
 
     `sign_known`: False where the recordings show its size only, as it acts by its square. `interval`: from low to high,
@@ -39,9 +40,6 @@ class ParameterValue(Frozen):
     determined, the name stands.
     """
 
-    value: float
-    std: float | None
-    unit: str
     sign_known: bool = True
     interval: tuple[float, float] | None = None
     is_determined: bool = True
@@ -54,6 +52,22 @@ class ParameterValue(Frozen):
         ends = (self.value - NORMAL_95 * self.std, self.value + NORMAL_95 * self.std)
         apart = max(abs(one - other) for one, other in zip(ends, self.interval, strict=True))
         return self.interval if apart > SKEWED * self.std or not self.is_determined else None
+
+
+class Combination(Frozen):
+    """What the recordings determine of parameters that they can't tell apart: the sum of `weights` times `parameters`,
+    each less its value in absence and raised to `power`, with the size's own sign.
+
+    The weights are the direction; the first is 1, and the unit that of the first parameter to that power.
+    """
+
+    side: Side
+    parameters: tuple[str, ...]
+    weights: tuple[float, ...]
+    power: int
+    value: float
+    std: float
+    unit: str
 
 
 class Rival(Frozen):
@@ -76,9 +90,9 @@ class NamedEffect(Frozen):
 
     `law`: `exact` where what the effects leave is within noise and the laws' tolerances, else `inexact`. `members`:
     where the family is named, its effects, likeliest first; `name` is then the family's identifier, and `parameters`
-    are those of the first member. `choices`: which of its alternatives the law is, by field: the corner of a glow.
-    `modes`: other values of the parameters, in their units, that fit as well. `shown_in`: measurements in which it
-    stands out of the noise, strongest first.
+    are those of the first member. `combinations`: of parameters that aren't determined by themselves. `choices`: which
+    of its alternatives the law is, by field: the corner of a glow. `modes`: other values of the parameters, in their
+    units, that fit as well. `shown_in`: measurements in which it stands out of the noise, strongest first.
     """
 
     name: str
@@ -88,6 +102,7 @@ class NamedEffect(Frozen):
     probability: float
     sides: tuple[Side, ...]
     parameters: dict[str, ParameterValue]
+    combinations: tuple[Combination, ...] = ()
     choices: dict[str, str] = {}
     modes: tuple[dict[str, float], ...] = ()
     shown_in: tuple[str, ...] = ()

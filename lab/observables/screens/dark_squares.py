@@ -29,8 +29,6 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import Uniform
 
-# share of the lit screen's level: light of lit parts that the model doesn't follow, and of the screen's surroundings
-SCREEN_FLOOR = 6e-4
 RADII, ANGLES = 24, 4  # nodes of frequency and orientation between which a transfer function is interpolated
 FINE_CY_PER_PX = 0.01  # frequency below which the nodes are evenly spaced
 
@@ -89,7 +87,6 @@ def measure_screen(dataset: Dataset) -> Observable:
     covariance += (
         same * np.outer(tail, tail) * dataset.tail_std**2
         + np.outer(beyond, beyond)
-        + np.outer(white, white) * SCREEN_FLOOR**2
         + np.diag(np.square(1e-4 * white))
         + same * (channel[:, None] == channel) * np.outer(digits, digits)
     )

@@ -81,6 +81,18 @@ def test_ladders_cancel_a_linear_drift() -> None:
     ]  # fmt: skip
 
 
+def test_flats_are_taken_at_every_gain() -> None:
+    """Each gain has steps of its own, which have the gain; without one it is the station's, and none is stated."""
+    one, two = (FlatSequence(levels=(0.2, 0.6), frames=2, gains_db=gains) for gains in ((), (6.0, 20.0)))
+    steps = two.steps(STATION)
+    assert steps[: len(one.steps(STATION))] == one.steps(STATION)
+    assert [s.setting.gain_db for s in steps if isinstance(s.exposure, FindExposure)] == [None, 6.0, 20.0]
+    assert {s.id.split("/")[1] for s in steps if s.setting.gain_db is not None} == {"6dB", "20dB"}
+    with pytest.raises(InputError, match=r"flat.gains_db: .*90.0 dB is above the upper limit 80.0 dB"):
+        full_plan(STATION, only=("flat",), parameters={"flat": {"gains_db": [90.0]}})
+    CapturePlan((two,)).steps(STATION)
+
+
 def test_flats_go_from_near_dark_to_beyond_saturation() -> None:
     levels = next(one for one in full_plan(STATION).sequences if isinstance(one, FlatSequence))
     assert min(levels.levels) <= 0.05

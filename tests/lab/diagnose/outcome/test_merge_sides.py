@@ -14,7 +14,7 @@ from lab.diagnose.outcome.merge_sides import merged
 from lab.diagnose.outcome.named_in_words import choices_of
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
-from lab.formats.results import DiagnosisLists, DiagnosisResult, NamedEffect, ParameterValue
+from lab.formats.results import Combination, DiagnosisLists, DiagnosisResult, NamedEffect, ParameterValue
 from lab.report.answers import effect_line
 from sim.camera import Side
 from sim.effects.base import Effect
@@ -148,3 +148,28 @@ def test_what_both_sides_share_is_no_better_told_by_two() -> None:
     assert "settling_min" not in drift.parameters
     hot = _both(HotPixels(excess_e_per_s=300.0), HOT.std).effects[0]
     assert hot.parameters["excess_e_per_s"].std == pytest.approx(20.0 / np.sqrt(2.0))
+
+
+def test_sizes_that_are_not_determined_are_reported_with_the_combination_that_is() -> None:
+    axial = effect("axial_chromatic_aberration")(slope_um=15.0, curvature_um=12.0)
+    combined = Combination(
+        side="left",
+        parameters=("slope_um", "curvature_um"),
+        weights=(1.0, 0.62),
+        power=2,
+        value=314.0,
+        std=9.0,
+        unit="um^2",
+    )
+    candidate = Candidate(axial, {"slope_um": 21.0, "curvature_um": 2.0}, 0.99, (), 40.0)
+    found = SideFindings(
+        side="left",
+        lists=DiagnosisLists(),
+        is_judged=True,
+        named=(NamedCandidate(candidate, ("slanted_edge",), combinations=(combined,)),),
+    )
+    (told,) = merged("a set", [found], DecisionPolicy()).effects
+    assert told.combinations == (combined,)
+    assert not told.parameters["slope_um"].is_determined and told.parameters["curvature_um"].is_determined
+    assert "slope 15 ± 21 µm, not determined, curvature 12.0 ± 2.0 µm, " in told.statement
+    assert "slope_um^2 + 0.62 curvature_um^2 = 314.0 ± 9.0 um^2 is, of the left camera" in told.statement
