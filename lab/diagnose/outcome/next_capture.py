@@ -44,8 +44,12 @@ SETTLING: dict[str, tuple[str, str | None]] = {
 }
 
 
-#: Between the effects of a rival that is a set of them.
-WITH = " with "
+#: Between the effects of a rival that is a set of them, and the name of one without any.
+WITH, NOTHING = " with ", "none"
+
+
+#: A rival without an effect, in a sentence.
+NO_EFFECT = "no further effect"
 
 
 @dataclass(frozen=True)
@@ -99,25 +103,22 @@ def next_sentence(found: Sequence[NextCapture], settling: str | None, policy: De
         return settling
     best = max(found, key=lambda one: one.distance)
     one, other = best.rivals
+    told, told_other = (NO_EFFECT if n == NOTHING else n for n in sorted(best.rivals, key=lambda n: n == NOTHING))
+    sigma = f"{np.sqrt(2.0 * best.distance):.1f}"
     if best.distance >= policy.next_capture_distance:
         return (
-            f"{best.capture[0].upper()}{best.capture[1:]} would tell {one} from {other}: their predictions lie "
-            f"{np.sqrt(2.0 * best.distance):.1f} "
-            f"standard deviations apart there, which decides rightly in {100 * min(best.told_apart, 0.999):.3g} % of "
-            "all cases."
+            f"{best.capture[0].upper()}{best.capture[1:]} would tell {told} from {told_other}: their predictions lie "
+            f"{sigma} standard deviations apart there, which decides rightly in "
+            f"{100 * min(best.told_apart, 0.999):.3g} % of all cases."
         )
-    beyond = (
-        f"no capture that can be predicted tells {one} from {other} by more than {np.sqrt(2.0 * best.distance):.1f} "
-        "standard deviations"
-    )
+    beyond = f"no capture that can be predicted tells {told} from {told_other} by more than {sigma} standard deviations"
     steady_by = {name: _invariances(name) for name in (one, other)}
     for thing, (capture, kind) in SETTLING.items():
         if thing in steady_by[one] ^ steady_by[other]:
             steady, moving = (one, other) if thing in steady_by[one] else (other, one)
             if any(_shows_in(effect, kind) for effect in moving.split(WITH)):
-                return (
-                    f"{capture[0].upper()}{capture[1:]} may tell them apart ({beyond}): only {steady} stays the same."
-                )
+                why = f"{moving} changes" if steady == NOTHING else f"only {steady} stays the same"
+                return f"{capture[0].upper()}{capture[1:]} may tell them apart ({beyond}): {why}."
     return f"{beyond[0].upper()}{beyond[1:]}: both depend on the same things."
 
 
