@@ -247,7 +247,7 @@ def _dark_squares(
         means = [float(channel_pixels(f, dataset.camera.cfa, channel).mean()) for f in (shown, black)]
         found.append(
             _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
-                         *(float(v) for v in np.sqrt(variances)), 0.5 * float(ends + endless),
+                         float(np.sqrt(variances[0])), float(np.sqrt(variances[1])), 0.5 * float(ends + endless),
                          added, use, Surroundings.of(harmonics(added), use), reach, 0.5 * float(endless - ends),
                          means[0] - means[1], float(full[bright].mean()),
                          float(black[plane][use].mean()) - noise.black,
