@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.capture_kinds.flat import FlatCapture
 from lab.cli import main
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet, write
@@ -118,6 +119,27 @@ def test_light_that_falls_off_by_a_quarter_is_told(make_mono_set: Callable[..., 
     assert not any(one.quantity.startswith("nonuniformity") for one in of(even, reading.standard).deviations)
 
 
+def test_level_whose_light_is_misstated_is_left_out(make_mono_set: Callable[..., RecordingSet]) -> None:
+    """One level states ten times its photons: the fit reports it, and no slope rests on it."""
+    recordings = make_mono_set(seed=3)
+    flats = recordings.captures(FlatCapture, "left")
+    wrong = {flat.id for flat in flats if flat.exposure_s == flats[16].exposure_s}
+    captures = tuple(
+        one.model_copy(update={"photons_per_pixel": 10.0 * one.photons_per_pixel}) if one.id in wrong else one
+        for one in recordings.captures()
+    )
+    misstated = recordings.under(recordings.manifest.model_copy(update={"captures": captures}))
+    fit = fit_recording_set(misstated)
+    made = misstated, fit, read_standards(misstated, fit)
+    found = {one.name: one.estimate for one in of(made, "EMVA 1288 R4.0 General").figures}
+    slope = found["nonlinearity"]
+    assert slope is not None
+    assert abs(slope.value - 1.0) < 3.5 * (slope.std or 0.0)
+    ratio = next(one.estimate for one in of(made, "ISO 15739:2023").figures if one.name == "fixed_pattern_snr")
+    assert ratio is not None
+    assert abs(ratio.value - 100.0) < 3.5 * (ratio.std or 0.0)
+
+
 def test_few_levels_and_images_are_told(even: Made) -> None:
     lines = [one.line for one in of(even, "EMVA 1288 R4.0 Linear").deviations]
     assert any(line.startswith("levels of light: 12; the standard asks for 50 at least") for line in lines)
@@ -179,3 +201,11 @@ def test_pdf_holds_all_pages(even: Made, tmp_path: Path) -> None:
     # an overview, and for each standard its text and its pictures, six a page
     least = 1 + sum(1 + -(-len(one.pictures) // 6) for one in found)
     assert data.count(b"/Type /Page ") + data.count(b"/Type /Page\n") >= least
+
+
+@pytest.mark.parametrize("option", ["--resolve", "--only=dark", "--set=dark.frames=3"])
+def test_session_of_the_standards_takes_no_other_plan(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", "--standards", "--out", str(tmp_path), option]) == 2
+    assert "--standards: takes its own sequences and no diagnosis" in " ".join(capsys.readouterr().err.split())
