@@ -11,7 +11,7 @@ c."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,12 +19,21 @@ from scipy import special
 
 from lab.diagnose.evidence.causes import LEAST_LISTED, Cause
 from lab.diagnose.evidence.side import DRAWS, FALSE_ALARM_RATE, EvidenceFindings
-from lab.diagnose.outcome.goodness_of_fit import told_as
-from lab.diagnose.outcome.merge_sides import LEAST_CAPTURES, choices_of, family_statement, plain_name, pooled
+from lab.diagnose.outcome.detectability import told_as
+from lab.diagnose.outcome.determined import combinations
+from lab.diagnose.outcome.named_in_words import (
+    LEAST_CAPTURES,
+    choices_of,
+    combination_in_words,
+    family_statement,
+    plain_name,
+    pooled,
+)
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DEFAULT_POLICY
 from lab.effect_titles import effect_title
 from lab.formats.results import (
+    Combination,
     DiagnosisLists,
     DiagnosisResult,
     DiagnosisVerdict,
@@ -37,10 +46,11 @@ from lab.formats.results import (
 )
 from lab.formats.results.words import measured
 from lab.inference.check import RATE as HELD_OUT_RATE
-from lab.inference.posterior import LIKELIER, NAMED
+from lab.inference.posterior import LIKELIER, NAMED, Size
 from lab.inference.search import REFITS
 from lab.observables.observable import measurement_title
 from sim.camera import Side
+from sim.parameters import Quantity
 
 #: Sets and members that a sentence lists.
 LISTED = 4
@@ -179,6 +189,9 @@ def _entry(one: _Named, found: Sequence[EvidenceFindings]) -> NamedEffect:
             is_determined=any(s.is_determined for s in sizes),
         )
     choices = choices_of(first.effect, first.alike)
+    combined = tuple(
+        c for side, cause in zip(one.sides, one.causes, strict=True) for c in _combined(side, cause, found)
+    )
     shown_in = tuple(dict.fromkeys(name for cause in one.causes for name in cause.shown_in))
     rest = (1.0 - one.probability) / max(1.0 - first.probability, 1e-15)
     rivals = [(name, p * min(rest, 1.0)) for name, p in first.rivals]
@@ -192,11 +205,12 @@ def _entry(one: _Named, found: Sequence[EvidenceFindings]) -> NamedEffect:
         probability=one.probability,
         sides=one.sides,
         parameters=parameters,
+        combinations=combined,
         choices=choices,
         modes=first.modes if len(alike) == 1 else (),
         shown_in=shown_in,
         rivals=tuple(Rival(name=n, probability=p) for n, p in rivals if p >= LEAST_LISTED),
-        statement=_statement(one, first, parameters, choices, shown_in, members, is_exact),
+        statement=_statement(one, first, parameters, combined, choices, shown_in, members, is_exact),
         reference=kind.reference,
     )
 
@@ -205,6 +219,7 @@ def _statement(
     one: _Named,
     first: Cause,
     parameters: dict[str, ParameterValue],
+    combined: Sequence[Combination],
     choices: dict[str, str],
     shown_in: Sequence[str],
     members: Sequence[Member],
@@ -212,7 +227,7 @@ def _statement(
 ) -> str:
     """Return a named cause as a sentence: what physics was left out, how that shows, and its size."""
     kind = first.kind
-    sizes = [_size(field, p) for field, p in parameters.items()]
+    sizes = [*(_size(field, p) for field, p in parameters.items()), *map(combination_in_words, combined)]
     sizes += [f"{field} {value}".replace("_", " ") for field, value in choices.items()]
     values = ", ".join(sizes)
     if any(not p.sign_known for p in parameters.values()):
@@ -222,6 +237,21 @@ def _statement(
     if members:
         return family_statement(kind.family, members, is_exact, seen, values, ())
     return f"{kind.sentence} {seen}: {values}."
+
+
+def _combined(side: Side, cause: Cause, found: Sequence[EvidenceFindings]) -> tuple[Combination, ...]:
+    """Return what the recordings of a side determine of a cause's sizes, where they can't tell these apart."""
+    declared = cause.kind.quantities()
+    sizes = [k for k, s in enumerate(cause.sizes) if s.parameter not in cause.kind.shapes and _is_size(declared, s)]
+    parameters = [(cause.sizes[k].parameter, declared[cause.sizes[k].parameter]) for k in sizes]
+    gain_is_known = all(f.gain_is_known for f in found if f.side == side)
+    return combinations(
+        side, parameters, cause.mean[sizes], cause.covariance[np.ix_(sizes, sizes)], gain_is_known=gain_is_known
+    )
+
+
+def _is_size(declared: Mapping[str, Quantity], size: Size) -> bool:
+    return declared[size.parameter].absent is not None
 
 
 def _size(field: str, value: ParameterValue) -> str:

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.refit import size_covariance
-from lab.diagnose.outcome.goodness_of_fit import told_as
+from lab.diagnose.outcome.detectability import told_as
 from lab.formats.results import Combination
 from sim.camera import Side
-from sim.effects.base import Effect
+from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
 #: Partial correlation of two coordinates from which they can't be told apart: each alone then has more than twice the
@@ -89,18 +87,24 @@ def _groups(correlation: FloatArray) -> list[list[int]]:
 
 
 def combinations(
-    side: Side, model: MeasurementModel, effects: tuple[Effect, ...], effect: Effect
+    side: Side,
+    parameters: Sequence[tuple[str, Quantity]],
+    from_absence: FloatArray,
+    covariance: FloatArray,
+    *,
+    gain_is_known: bool,
 ) -> tuple[Combination, ...]:
-    """Return what the recordings determine of the sizes of one of `effects`, where they can't tell these apart."""
-    if effect not in effects:
-        return ()
-    coords, from_absence, covariance = size_covariance(model, effects, effects.index(effect))
+    """Return what the recordings determine of an effect's sizes, where they can't tell these apart.
+
+    parameters : name and declaration of each coordinate
+    from_absence : the coordinates less their values in absence (k,)
+    covariance : theirs (k, k)
+    """
     found = []
-    for power in sorted({int(c.quantity.linear_power) for c in coords if not c.quantity.logarithmic}):
-        own = [k for k, c in enumerate(coords) if c.quantity.linear_power == power and not c.quantity.logarithmic]
+    for power in sorted({int(q.linear_power) for _, q in parameters if not q.logarithmic}):
+        own = [k for k, (_, q) in enumerate(parameters) if q.linear_power == power and not q.logarithmic]
         for one in determined_directions(from_absence[own], covariance[np.ix_(own, own)]):
-            members = [coords[own[k]] for k in one.members]
-            told = [told_as(c.name, c.quantity, gain_is_known=model.gain_is_known) for c in members]
+            told = [told_as(*parameters[own[k]], gain_is_known=gain_is_known) for k in one.members]
             found.append(
                 Combination(
                     side=side,
@@ -125,12 +129,3 @@ def is_determined(value: float, absent: float, std: float | None, interval: tupl
     if interval is not None:
         return not interval[0] <= absent <= interval[1]
     return std is None or abs(value - absent) >= NORMAL_95 * std
-
-
-def sum_words(names: Sequence[str], weights: Sequence[float]) -> str:
-    """Return a combination as a formula: `a + 0.52 b - 2 c`."""
-    text = names[0]
-    for name, weight in zip(names[1:], weights[1:], strict=True):
-        size = f"{abs(weight):.2g}"
-        text += f" {'-' if weight < 0.0 else '+'} {'' if size == '1' else f'{size} '}{name}"
-    return text
