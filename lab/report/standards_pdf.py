@@ -172,14 +172,29 @@ class _Sheet:
             )
 
 
+def has_matplotlib() -> bool:
+    """Return whether matplotlib is installed. Its distribution is asked for: where it isn't, colour-science puts
+    modules of that name in its place, which can be imported and draw nothing."""
+    try:
+        metadata.version("matplotlib")
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def check_pdf() -> None:
+    """Raise InputError where matplotlib isn't installed, before anything is computed for a PDF."""
+    if not has_matplotlib():
+        raise InputError("--pdf: matplotlib isn't installed; pip install 'calibench[pdf]'")
+
+
 def write_standards_pdf(file: Path, result: StandardsResult, found: Sequence[StandardSection], name: str) -> Path:
     """Write all standards as the PDF `file`: completely, or not at all. `found`: what the pages hold; `name`: of the
     recordings. Raises InputError where matplotlib isn't installed or the file can't be written."""
-    try:
-        import matplotlib as mpl
-        from matplotlib.backends.backend_pdf import PdfPages
-    except ImportError as error:
-        raise InputError("--pdf: matplotlib isn't installed; pip install 'calibench[pdf]'") from error
+    check_pdf()
+    import matplotlib as mpl
+    from matplotlib.backends.backend_pdf import PdfPages
+
     made = datetime.now(UTC)
     running = f"{name}; calibench {metadata.version('calibench')}, {made:%Y-%m-%d %H:%M} UTC"
     try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +15,7 @@ from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet, write
 from lab.formats.results import FitResult, StandardReading, StandardsResult
 from lab.report.standards import file_name, sections, write_standards
-from lab.report.standards_pdf import write_standards_pdf
+from lab.report.standards_pdf import has_matplotlib, write_standards_pdf
 from lab.standards.reading import STANDARDS, read_standards
 from lab.standards.standard import Figure, Standard
 from tests.lab.standards.conftest import EDGE_SIGMA_PX, EFFICIENCY, FULL_E, GAIN, READ_E
@@ -191,7 +190,7 @@ def test_command(
 
 @pytest.mark.extra
 def test_pdf_holds_all_pages(even: Made, tmp_path: Path) -> None:
-    if importlib.util.find_spec("matplotlib") is None:
+    if not has_matplotlib():
         missing("matplotlib isn't installed; `make peers` installs it")
     recordings, fit, result = even
     found = sections(result, recordings, fit)
@@ -201,6 +200,14 @@ def test_pdf_holds_all_pages(even: Made, tmp_path: Path) -> None:
     # an overview, and a page at least for each standard; three rows of two pictures fill one
     least = 1 + sum(max(1, len(one.pictures) // 6) for one in found)
     assert data.count(b"/Type /Page ") + data.count(b"/Type /Page\n") >= least
+
+
+def test_pdf_without_matplotlib_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("lab.report.standards_pdf.has_matplotlib", lambda: False)
+    assert main(["standards", str(tmp_path / "nothing"), "--pdf", str(tmp_path / "all.pdf")]) == 2
+    assert "pip install 'calibench[pdf]'" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize("option", ["--resolve", "--only=dark", "--set=dark.frames=3"])
