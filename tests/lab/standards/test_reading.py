@@ -139,6 +139,33 @@ def test_level_whose_light_is_misstated_is_left_out(make_mono_set: Callable[...,
     assert abs(ratio.value - 100.0) < 3.5 * (ratio.std or 0.0)
 
 
+def test_bias_of_the_gain_under_brighter_fatter_is_that_of_the_line_and_is_told(
+    make_mono_set: Callable[..., RecordingSet],
+) -> None:
+    """Of a variance K x (1 - a x), the standard's line through the origin over levels x_i has K (1 - a sum x^3 / sum
+    x^2). The page states the difference from the slope at zero signal of the joint fit, which is K."""
+    loss = 0.1
+    recordings = make_mono_set(levels=20, seed=4, variance_loss=loss)
+    fit = fit_recording_set(recordings)
+    reading = of((recordings, fit, read_standards(recordings, fit)), "EMVA 1288 R4.0 Linear")
+    noise = fit.cameras["left"].noise
+    assert noise is not None
+    shares = np.linspace(0.02, 0.9, 18)
+    used = shares[shares <= 0.7 * 0.9]  # the largest variance is that of the level of 0.9
+    expected = GAIN * (1.0 - loss * np.sum(used**3) / np.sum(used**2))
+    assert 1.0 - expected / GAIN > 0.03
+    line = next(one.estimate for one in reading.figures if one.name == "system_gain")
+    assert line is not None
+    # 6144 pixels, 3 degrees of freedom each: a variance to 1.0 %, the slope of 12 levels, the brighter ones mostly, to
+    # 0.4 %
+    assert line.value == pytest.approx(expected, rel=3.5 * 0.004)
+    at_zero, std = noise.conversion_gain_at_zero_dn_per_e, noise.conversion_gain_at_zero_dn_per_e_std
+    assert at_zero is not None
+    assert std is not None
+    assert abs(at_zero - GAIN) < 3.5 * std
+    assert any("brighter-fatter effect bend" in line for line in reading.remarks)
+
+
 def test_few_levels_and_images_are_told(even: Made) -> None:
     lines = [one.line for one in of(even, "EMVA 1288 R4.0 Linear").deviations]
     assert any(line.startswith("levels of light: 12; the standard asks for 50 at least") for line in lines)
