@@ -163,6 +163,10 @@ def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
         yield "The fits' own standard deviations; nothing was compared with a model."
         return
     yield from (_sure_of(effect) for effect in diagnosis.effects[:NAMED])
+    if diagnosis.engine == "evidence" and diagnosis.verdict == "no_mismatch":
+        for one in diagnosis.models:
+            nothing = sum(item.probability for item in one.sets if not item.effects and not item.unlisted)
+            yield f"No effect and nothing unlisted in the {one.side} camera: probability {nothing:.3f}."
     held = diagnosis.held_out
     if held is not None and held.n and (diagnosis.effects or held.chi2_discovered is not None):
         laws = held.chi2_discovered

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 
 from lab.diagnose.discovery.words import departure_unit
-from lab.diagnose.outcome.goodness_of_fit import detectable, told_as
+from lab.diagnose.outcome.detectability import detectable, told_as
 from lab.formats.results import (
     DiagnosisResult,
     DiscoveredLaw,

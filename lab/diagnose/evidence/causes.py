@@ -9,7 +9,7 @@ import numpy as np
 
 from lab.diagnose.evidence.side_table import SideTable
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.outcome.next_capture import WITH
+from lab.diagnose.outcome.next_capture import NOTHING, WITH
 from lab.inference.posterior import NAMED, Size, parameter_draws, parameter_slice, sizes_of, weights_of_sets
 from lab.inference.search import FittedSet, Table
 from sim.effects.base import Effect
@@ -27,8 +27,6 @@ SIGN_KNOWN = 0.975
 #: chi2 of an effect's change from which on a measurement shows it (five standard deviations), and its least share of
 #: the strongest measurement's.
 SHOWN_CHI2, SHOWN_SHARE = 25.0, 0.02
-#: What stands in the place of an effect in a set without it.
-NOTHING = "none"
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from lab.capture_kinds.base import Equipment
-from lab.diagnose.evidence.causes import NOTHING
 from lab.diagnose.evidence.side_table import SideTable
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
-from lab.diagnose.outcome.next_capture import WITH, Doubt, OpenCapture
+from lab.diagnose.outcome.next_capture import NOTHING, WITH, Doubt, OpenCapture
 from lab.inference.hypotheses import moved, stacked
 from lab.inference.search import FittedSet
 from lab.observables.spectra.curves import freed_curve

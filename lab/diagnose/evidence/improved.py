@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lab.capture_kinds.flat import FlatCapture
-from lab.diagnose.evidence.causes import NOTHING, Cause
+from lab.diagnose.evidence.causes import Cause
 from lab.diagnose.evidence.side_table import SideTable, posterior_means, weighted_residual
-from lab.diagnose.outcome.improved_model import (
+from lab.diagnose.outcome.corrections import (
     Applied,
     Correction,
     correction_on,
@@ -21,7 +21,7 @@ from lab.diagnose.outcome.improved_model import (
     scaled_curve,
 )
 from lab.diagnose.outcome.model_posterior import lasting_means_of, model_posterior
-from lab.diagnose.outcome.next_capture import WITH
+from lab.diagnose.outcome.next_capture import NOTHING, WITH
 from lab.formats.camera_file import CameraFile
 from lab.formats.camera_model import camera_model, remarks_on_values
 from lab.formats.model_posterior import NameInDoubt, RivalModel, StoredEffect

@@ -11,7 +11,7 @@ c."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +19,16 @@ from scipy import special
 
 from lab.diagnose.evidence.causes import LEAST_LISTED, Cause
 from lab.diagnose.evidence.side import DRAWS, FALSE_ALARM_RATE, EvidenceFindings
-from lab.diagnose.outcome.determined import combination_words, combinations_of
-from lab.diagnose.outcome.goodness_of_fit import told_as
-from lab.diagnose.outcome.merge_sides import LEAST_CAPTURES, choices_of, family_statement, plain_name, pooled
+from lab.diagnose.outcome.detectability import told_as
+from lab.diagnose.outcome.determined import combinations
+from lab.diagnose.outcome.named_in_words import (
+    LEAST_CAPTURES,
+    choices_of,
+    combination_in_words,
+    family_statement,
+    plain_name,
+    pooled,
+)
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DEFAULT_POLICY
 from lab.effect_titles import effect_title
@@ -39,10 +46,11 @@ from lab.formats.results import (
 )
 from lab.formats.results.words import measured
 from lab.inference.check import RATE as HELD_OUT_RATE
-from lab.inference.posterior import LIKELIER, NAMED
+from lab.inference.posterior import LIKELIER, NAMED, Size
 from lab.inference.search import REFITS
 from lab.observables.observable import measurement_title
 from sim.camera import Side
+from sim.parameters import Quantity
 
 #: Sets and members that a sentence lists.
 LISTED = 4
@@ -180,13 +188,10 @@ def _entry(one: _Named, found: Sequence[EvidenceFindings]) -> NamedEffect:
             interval=size.interval if len(alike) == 1 else (value - 1.96 * (std or 0.0), value + 1.96 * (std or 0.0)),
             is_determined=any(s.is_determined for s in sizes),
         )
-    combined = tuple(
-        combination
-        for side, cause in zip(one.sides, one.causes, strict=True)
-        if cause.kind is kind
-        for combination in _combinations(side, cause, gain_is_known)
-    )
     choices = choices_of(first.effect, first.alike)
+    combined = tuple(
+        c for side, cause in zip(one.sides, one.causes, strict=True) for c in _combined(side, cause, found)
+    )
     shown_in = tuple(dict.fromkeys(name for cause in one.causes for name in cause.shown_in))
     rest = (1.0 - one.probability) / max(1.0 - first.probability, 1e-15)
     rivals = [(name, p * min(rest, 1.0)) for name, p in first.rivals]
@@ -210,15 +215,6 @@ def _entry(one: _Named, found: Sequence[EvidenceFindings]) -> NamedEffect:
     )
 
 
-def _combinations(side: Side, cause: Cause, gain_is_known: bool) -> tuple[Combination, ...]:
-    """Return what one side determines of a cause's sizes that it can't tell apart."""
-    quantities = cause.kind.quantities()
-    every = [(size.parameter, quantities[size.parameter]) for size in cause.sizes]
-    own = [k for k, (name, q) in enumerate(every) if q.absent is not None and name not in cause.kind.shapes]
-    covariance = cause.covariance[np.ix_(own, own)]
-    return combinations_of(side, [every[k] for k in own], cause.mean[own], covariance, gain_is_known=gain_is_known)
-
-
 def _statement(
     one: _Named,
     first: Cause,
@@ -231,8 +227,7 @@ def _statement(
 ) -> str:
     """Return a named cause as a sentence: what physics was left out, how that shows, and its size."""
     kind = first.kind
-    sizes = [_size(field, p) for field, p in parameters.items()]
-    sizes += [combination_words(c) for c in combined]
+    sizes = [*(_size(field, p) for field, p in parameters.items()), *map(combination_in_words, combined)]
     sizes += [f"{field} {value}".replace("_", " ") for field, value in choices.items()]
     values = ", ".join(sizes)
     if any(not p.sign_known for p in parameters.values()):
@@ -242,6 +237,21 @@ def _statement(
     if members:
         return family_statement(kind.family, members, is_exact, seen, values, ())
     return f"{kind.sentence} {seen}: {values}."
+
+
+def _combined(side: Side, cause: Cause, found: Sequence[EvidenceFindings]) -> tuple[Combination, ...]:
+    """Return what the recordings of a side determine of a cause's sizes, where they can't tell these apart."""
+    declared = cause.kind.quantities()
+    sizes = [k for k, s in enumerate(cause.sizes) if s.parameter not in cause.kind.shapes and _is_size(declared, s)]
+    parameters = [(cause.sizes[k].parameter, declared[cause.sizes[k].parameter]) for k in sizes]
+    gain_is_known = all(f.gain_is_known for f in found if f.side == side)
+    return combinations(
+        side, parameters, cause.mean[sizes], cause.covariance[np.ix_(sizes, sizes)], gain_is_known=gain_is_known
+    )
+
+
+def _is_size(declared: Mapping[str, Quantity], size: Size) -> bool:
+    return declared[size.parameter].absent is not None
 
 
 def _size(field: str, value: ParameterValue) -> str:

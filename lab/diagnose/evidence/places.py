@@ -14,9 +14,9 @@ from scipy import special
 
 from lab.diagnose.evidence.causes import SHOWN_CHI2, SHOWN_SHARE, Cause, shown_in
 from lab.diagnose.evidence.side_table import SideTable, posterior_means
-from lab.diagnose.inference.locate import Slice, describe, log_tail, slices_of
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.outcome.goodness_of_fit import detectable, smallest_sizes, told_as
+from lab.diagnose.inference.places import Slice, describe, log_tail, slices_of
+from lab.diagnose.outcome.detectability import detectable, smallest_sizes, told_as
 from lab.formats.results import (
     ExaminedPlace,
     HeldOut,

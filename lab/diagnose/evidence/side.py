@@ -27,9 +27,9 @@ from lab.diagnose.evidence.places import (
 )
 from lab.diagnose.evidence.side_table import SideTable, predict_by_baseline
 from lab.diagnose.metadata import misstatements, unchecked
-from lab.diagnose.outcome.improved_model import residual_pictures
-from lab.diagnose.outcome.mismatches import impossible_efficiency, misstated_light
+from lab.diagnose.metadata.stated_light import impossible_efficiency, misstated_light
 from lab.diagnose.outcome.next_capture import Doubt
+from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet

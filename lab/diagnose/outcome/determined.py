@@ -13,13 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.refit import size_covariance
-from lab.diagnose.outcome.goodness_of_fit import told_as
+from lab.diagnose.outcome.detectability import told_as
 from lab.formats.results import Combination
-from lab.formats.results.words import measured
 from sim.camera import Side
-from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
@@ -91,17 +87,6 @@ def _groups(correlation: FloatArray) -> list[list[int]]:
 
 
 def combinations(
-    side: Side, model: MeasurementModel, effects: tuple[Effect, ...], effect: Effect
-) -> tuple[Combination, ...]:
-    """Return what the recordings determine of the sizes of one of `effects`, where they can't tell these apart."""
-    if effect not in effects:
-        return ()
-    coords, from_absence, covariance = size_covariance(model, effects, effects.index(effect))
-    named = [(c.name, c.quantity) for c in coords]
-    return combinations_of(side, named, from_absence, covariance, gain_is_known=model.gain_is_known)
-
-
-def combinations_of(
     side: Side,
     parameters: Sequence[tuple[str, Quantity]],
     from_absence: FloatArray,
@@ -109,19 +94,17 @@ def combinations_of(
     *,
     gain_is_known: bool,
 ) -> tuple[Combination, ...]:
-    """Return what is determined of an effect's sizes that can't be told apart.
+    """Return what the recordings determine of an effect's sizes, where they can't tell these apart.
 
-    parameters : name and quantity of each size
-    from_absence : of each, sign(p - absent) |p - absent|^linear_power, (k,)
+    parameters : name and declaration of each coordinate
+    from_absence : the coordinates less their values in absence (k,)
     covariance : theirs (k, k)
     """
     found = []
-    linear = [k for k, (_, quantity) in enumerate(parameters) if not quantity.logarithmic]
-    for power in sorted({int(parameters[k][1].linear_power) for k in linear}):
-        own = [k for k in linear if parameters[k][1].linear_power == power]
+    for power in sorted({int(q.linear_power) for _, q in parameters if not q.logarithmic}):
+        own = [k for k, (_, q) in enumerate(parameters) if q.linear_power == power and not q.logarithmic]
         for one in determined_directions(from_absence[own], covariance[np.ix_(own, own)]):
-            members = [parameters[own[k]] for k in one.members]
-            told = [told_as(name, quantity, gain_is_known=gain_is_known) for name, quantity in members]
+            told = [told_as(*parameters[own[k]], gain_is_known=gain_is_known) for k in one.members]
             found.append(
                 Combination(
                     side=side,
@@ -136,12 +119,6 @@ def combinations_of(
     return tuple(found)
 
 
-def combination_words(one: Combination) -> str:
-    """Return in words what the recordings determine of parameters that they can't tell apart."""
-    names = [f"{name}^{one.power}" if one.power > 1 else name for name in one.parameters]
-    return f"{sum_words(names, one.weights)} = {measured(one.value, one.std, one.unit)} is, of the {one.side} camera"
-
-
 def _raised(unit: str, power: int) -> str:
     """Return a unit to a power: `um^2`."""
     return unit if power == 1 or unit == "1" else f"{unit}^{power}" if unit.isalpha() else f"({unit})^{power}"
@@ -152,12 +129,3 @@ def is_determined(value: float, absent: float, std: float | None, interval: tupl
     if interval is not None:
         return not interval[0] <= absent <= interval[1]
     return std is None or abs(value - absent) >= NORMAL_95 * std
-
-
-def sum_words(names: Sequence[str], weights: Sequence[float]) -> str:
-    """Return a combination as a formula: `a + 0.52 b - 2 c`."""
-    text = names[0]
-    for name, weight in zip(names[1:], weights[1:], strict=True):
-        size = f"{abs(weight):.2g}"
-        text += f" {'-' if weight < 0.0 else '+'} {'' if size == '1' else f'{size} '}{name}"
-    return text

@@ -609,6 +609,10 @@ def test_a_table_of_sets_is_shown_with_what_is_unlisted(
     assert "Unlisted physics acts on the transfer of the left camera: probability 0.61." in text
     assert "Left: 0.4 % of the probability belongs to sets that were not refitted." in text
     assert "2 (0 to 5.5) µm, not determined" in text
+    none = SideModels(side="left", share=0.95, sets=(EffectSet(effects=(), probability=0.961),), inclusion=())
+    clean = by_table.model_copy(update={"verdict": "no_mismatch", "models": (none,), "effects": (), "unlisted": ()})
+    clean_text = Page(render_report(recordings, fit, validation, clean, provenance_of(recordings))).text
+    assert "No effect and nothing unlisted in the left camera: probability 0.961." in clean_text
     ((_, rows),) = odds(by_table)
     assert sum(probability for _, probability in rows) == pytest.approx(1.0)
 

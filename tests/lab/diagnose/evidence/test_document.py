@@ -13,9 +13,8 @@ from evaluation.draw import recordings_of
 from evaluation.independent_simulator import LISTED, WHOLE_SESSION, ConcealedCamera, Law
 from lab.diagnose import Diagnosis, examine
 from lab.diagnose.evidence import doubt
-from lab.diagnose.evidence.causes import NOTHING
 from lab.diagnose.outcome.expected_information import entropy, expected_information
-from lab.diagnose.outcome.next_capture import WITH
+from lab.diagnose.outcome.next_capture import NOTHING, WITH
 from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult

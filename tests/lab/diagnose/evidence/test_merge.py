@@ -13,7 +13,9 @@ from lab.diagnose.evidence.merge import joint_probability, merged_evidence
 from lab.diagnose.evidence.side import EvidenceFindings
 from lab.diagnose.evidence.side_table import SideTable
 from lab.diagnose.outcome.expected_information import Forecast, settling_probability
-from lab.formats.results import DiagnosisLists
+from lab.diagnose.outcome.next_capture import NOTHING, next_sentence
+from lab.diagnose.policy import DEFAULT_POLICY
+from lab.formats.results import DiagnosisLists, NextCapture
 from lab.inference.hypotheses import SetPrior
 from lab.inference.posterior import Size
 from sim.camera import Side
@@ -144,3 +146,14 @@ def test_sizes_that_one_side_cannot_tell_apart_are_reported_by_their_sum() -> No
     assert (one.value, one.std) == (pytest.approx(290.0), pytest.approx(100.0 * np.sqrt(0.02)))
     assert "slope_um^2 + curvature_um^2 = 290 ± 14 um^2 is, of the left camera" in named.statement
     assert not any(value.is_determined for value in named.parameters.values())
+
+
+def test_a_rival_without_an_effect_is_told_as_such() -> None:
+    """Defocus depends on the f-number, nothing doesn't: another f-number may tell them apart."""
+    offered = NextCapture(
+        side="left", capture="edges", rivals=(NOTHING, "defocus"), distance=0.1, told_apart=0.6, settles=0.0
+    )
+    sentence = next_sentence((offered,), None, DEFAULT_POLICY)
+    assert sentence is not None
+    assert "no capture that can be predicted tells defocus from no further effect" in sentence
+    assert sentence.endswith("defocus changes.")

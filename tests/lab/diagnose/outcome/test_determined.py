@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.diagnose.outcome.determined import determined_directions, is_determined, sum_words
+from lab.diagnose.outcome.determined import determined_directions, is_determined
+from lab.diagnose.outcome.named_in_words import sum_words
 
 
 def test_two_parameters_with_one_signature_are_their_sum() -> None:

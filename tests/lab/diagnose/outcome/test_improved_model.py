@@ -15,7 +15,9 @@ from evaluation.independent_simulator import laws as concealed_laws
 from lab.diagnose import Diagnosis, examine
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
 from lab.diagnose.inference.measurement_model import MeasurementModel, form_name
-from lab.diagnose.outcome.improved_model import improved_model, nearest_form, residual_pictures
+from lab.diagnose.outcome.corrections import nearest_form
+from lab.diagnose.outcome.improved_model import improved_model
+from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile, default_camera, read_camera, write_camera
 from lab.formats.camera_model import camera_model

@@ -10,7 +10,8 @@ import pytest
 from pydantic import Field
 
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.outcome.merge_sides import choices_of, merged
+from lab.diagnose.outcome.merge_sides import merged
+from lab.diagnose.outcome.named_in_words import choices_of
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
 from lab.formats.results import Combination, DiagnosisLists, DiagnosisResult, NamedEffect, ParameterValue

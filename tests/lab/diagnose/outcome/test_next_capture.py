@@ -15,7 +15,8 @@ from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.outcome.candidate_captures import CandidateCapture, Hypothesis, candidate_captures
-from lab.diagnose.outcome.next_capture import doubt_of, next_sentence
+from lab.diagnose.outcome.next_capture import next_sentence
+from lab.diagnose.outcome.rivals_in_doubt import doubt_of
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.visibility import visibility
