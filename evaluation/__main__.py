@@ -274,14 +274,17 @@ def engines_command(
         ),
     ],
     with_diagnosis: Annotated[bool, typer.Option("--with-diagnosis", help="also run today's diagnosis")] = False,
+    scales: Annotated[
+        bool, typer.Option("--scales", help="instead: count names that change with everyday scales halved and doubled")
+    ] = False,
 ) -> None:
     """Print what the evidence engine reports of recordings.
 
     Example: python -m evaluation engines own:1 --with-diagnosis
     """
-    from evaluation.engines import compare
+    from evaluation.engines import compare, vary_scales
 
-    for line in compare(sets, with_diagnosis=with_diagnosis):
+    for line in vary_scales(sets) if scales else compare(sets, with_diagnosis=with_diagnosis):
         print(line, flush=True)
 
 

@@ -86,7 +86,8 @@ def lines(outcome: Outcome) -> Iterator[str]:
         words = [
             f"{s.parameter} {s.mean:.4g} +- {s.std:.2g}" + " (not determined)" * (not s.is_determined) for s in sizes
         ]
-        yield f"    size of {name}: {', '.join(words)}"
+        law = f"; its law is inexact with p {posterior.inexact[name]:.2f}" if posterior.inexact[name] > 0.5 else ""
+        yield f"    size of {name}: {', '.join(words)}{law}"
     total, count = sum(c.chi2 for c in outcome.checked), sum(c.n for c in outcome.checked)
     against = ", ".join(f"{c.measurement} chi2 {c.chi2:.1f} of {c.n}" for c in outcome.checked if c.contradicts)
     yield f"    held out: chi2 {total:.0f} of {count}; contradicted by: {against or 'none'}"
@@ -121,6 +122,32 @@ def _law(name: str) -> type[Law]:
             return law
     known = ", ".join(sorted(law.name for law in (*LISTED, *OUTSIDE)))
     raise InputError(f"law {name!r}: isn't known; choose one of {known}")
+
+
+#: Factors to all everyday scales by which the names must not change, and the share of sides in which they may.
+FACTORS, MOST_CHANGED = (0.5, 2.0), 0.02
+
+
+def vary_scales(names: Sequence[str]) -> Iterator[str]:
+    """Yield, by side, what is named with all everyday scales as declared, halved and doubled; at the end the share of
+    repeats whose names differ."""
+    repeats = changed = 0
+    for name in names:
+        recordings = recordings_named(name)
+        for side in recordings.sides:
+            problem = measure_side(recordings, side, fit_recording_set)
+            if problem is None:
+                continue
+            named = {}
+            for factor in (1.0, *FACTORS):
+                search, table = search_side(problem, everyday=factor)
+                named[factor] = frozenset(f.name for f in read_table(table, search.hypotheses).named)
+            differ = sum(named[factor] != named[1.0] for factor in FACTORS)
+            repeats, changed = repeats + len(FACTORS), changed + differ
+            words = "; ".join(f"x {f:g}: {', '.join(sorted(own)) or 'nothing'}" for f, own in named.items())
+            yield f"{name} {side}: {words}{' (changed)' * (differ > 0)}"
+    share = changed / max(repeats, 1)
+    yield f"names changed in {changed} of {repeats} repeats ({100 * share:.1f} %; at most {100 * MOST_CHANGED:.0f} %)"
 
 
 def compare(names: Sequence[str], *, with_diagnosis: bool) -> Iterator[str]:

@@ -74,6 +74,7 @@ class CaptureRequest:
     only : names of the sequences to take, where `plan` is None; empty: all
     parameters : values of the sequences' parameters in place of a full session's, where `plan` is None
     demands_certified : a new session runs only with cameras that have a certified calibration
+    standards : take what the standards ask for, where `plan` is None, in place of `only` and `parameters`
     """
 
     session: str = ""
@@ -84,6 +85,7 @@ class CaptureRequest:
     name: str = ""
     notes: str = ""
     demands_certified: bool = False
+    standards: bool = False
 
 
 @dataclass(frozen=True)
@@ -244,7 +246,7 @@ def capture_here(
     Raises what `CaptureSession.run` raises, and `Cancelled` if `tell` does: the session can then be resumed.
     """
     from lab.calibration.life import check_certified
-    from lab.capture.plan import full_plan
+    from lab.capture.plan import full_plan, standards_plan
     from lab.capture.session import CaptureSession
     from lab.capture.station import drivers_of
 
@@ -266,10 +268,15 @@ def capture_here(
             store, request.session, station=station, on_progress=told, connect=drivers, check_certified=check_certified
         )
     else:
+        usual = (
+            standards_plan(station, request.quick)
+            if request.standards
+            else full_plan(station, request.quick, request.only or None, request.parameters)
+        )
         session = CaptureSession.start(
             store,
             station,
-            request.plan or full_plan(station, request.quick, request.only or None, request.parameters),
+            request.plan or usual,
             name=request.name,
             notes=request.notes,
             demands_certified=request.demands_certified,

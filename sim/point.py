@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import reduce
-from itertools import product
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -228,23 +227,38 @@ def mix_channels(
 
     charge = charge_of(camera, effects)
     kernel = reduce(convolve2d, [*charge.kernels, *charge.trail_kernels(place_um)], np.ones((1, 1)))
-    half, step, phases = np.array(kernel.shape) // 2, mosaic.step(camera.cfa), mosaic.phases(camera.cfa)
-    channel_at = {place: i for i, name in enumerate(camera.channels) for place in phases[name]}
-    out = np.zeros(transfers.shape, complex)
+    step, phases, count = mosaic.step(camera.cfa), mosaic.phases(camera.cfa), len(camera.channels)
+    source_at = np.zeros((step, step), int)
     for i, name in enumerate(camera.channels):
-        total = 0.0
-        for (row, col), ((r, c), share) in product(phases[name], np.ndenumerate(kernel)):
-            if share == 0.0:
-                continue
-            down, right = int(r - half[0]), int(c - half[1])
-            source = channel_at[(row - down) % step, (col - right) % step]
-            part = float(share) * float(signals[source])
-            out[i] += part * transfers[source] * np.exp(-2j * np.pi * (fx_cy_per_px * right + fy_cy_per_px * down))
-            total += part
-        if not total > 0.0:  # no light: as it was
-            out[i], total = transfers[i], 1.0
-        out[i] /= total
-    return out
+        source_at[tuple(np.transpose(phases[name]))] = i
+    down, right = (np.arange(n) - n // 2 for n in kernel.shape)
+    # the electrons that come from each source by each offset, (channels, sources, down, right)
+    moved = np.zeros((count, count, *kernel.shape))
+    for i, name in enumerate(camera.channels):
+        for row, col in phases[name]:
+            source = source_at[np.ix_((row - down) % step, (col - right) % step)]
+            for k in range(count):
+                moved[i, k] += np.where(source == k, kernel * float(signals[k]), 0.0)
+    shape = transfers.shape[1:]
+    fx, fy = (np.broadcast_to(f, shape).ravel() for f in (fx_cy_per_px, fy_cy_per_px))
+    along_x, along_y = _turned(right, fx), _turned(down, fy)
+    out = np.zeros((count, len(fx)), complex)
+    for i, k, d in np.argwhere(moved.any(axis=3)):
+        row = (moved[i, k, d] @ along_x.view(float)).view(complex)
+        out[i] += row * along_y[d] * transfers[k].ravel()
+    total = moved.sum(axis=(1, 2, 3))
+    lit = total > 0.0
+    out[lit] /= total[lit, None]
+    out[~lit] = transfers.reshape(count, -1)[~lit]  # no light: as it was
+    return np.asarray(out.reshape(transfers.shape))
+
+
+def _turned(steps: NDArray[np.integer[Any]], f: FloatArray) -> ComplexArray:
+    """Return exp(-2 pi i f n) of successive whole n, (n, frequencies)."""
+    turn = np.exp(-2j * np.pi * f)
+    factors = np.broadcast_to(turn, (len(steps), len(f))).copy()
+    factors[0] = turn ** steps[0]
+    return np.asarray(np.cumprod(factors, axis=0))
 
 
 def trail_behind(camera: CameraModel, effects: Sequence[Acts], axis: Literal[0, 1], line: float, lag_px: int) -> float:

@@ -21,6 +21,7 @@ from lab.observables.observable import Observable
 from sim.effects.base import Effect
 from sim.effects.empirical_law import PLACES, Along, EmpiricalLaw, Of, Stage
 from sim.effects.model_discrepancy import ModelDiscrepancy
+from sim.effects.screen_gamma import ScreenGamma
 from sim.spectrum import FloatArray
 
 #: Change of a node for the differences: small, so that they are derivatives; of factors 1 %.
@@ -30,6 +31,10 @@ _NODES_CORRELATED = 2.0
 #: Distance of the nodes of the transmittance, nm, and their correlation length in nodes: coatings ripple with periods
 #: of some tens of nm.
 _SPECTRAL_STEP_NM, _SPECTRAL_CORRELATED, _MOST_SPECTRAL = 10.0, 1.5, 48
+#: Nodes of the transfer function, cycles a pixel: closer towards 0, where a halo of some pixels acts.
+_TRANSFER_NODES = (0.0, 0.01, 0.03, 0.06, 0.12, 0.2, 0.32, 0.46, 0.64, 0.82, 1.0)
+#: Widths of the borders of a screen's cells at which their exponent varies, px.
+_RIMS_PX = (0.0, 0.3)
 #: Correlation between two channels, and between two conditions, of one observable.
 _BETWEEN = 0.7
 #: Columns of a group that are kept, by what they may change at its largest scale: variances, in the numbers' noise.
@@ -50,7 +55,7 @@ class GroupDeclaration:
     observables: tuple[str, ...] = ()
 
 
-TRANSFER, FIELD, SPECTRAL, RESPONSE, SOURCE, OFFSET, SHOT = (
+TRANSFER, FIELD, SPECTRAL, RESPONSE, SOURCE, OFFSET, SHOT, BORDERS = (
     GroupDeclaration(
         "transfer", 0.002, "1, of the transfer function",
         "healthy sets of a simulator with transfer functions in closed form: 0.1 % at most; twice that for real lenses",
@@ -76,6 +81,11 @@ TRANSFER, FIELD, SPECTRAL, RESPONSE, SOURCE, OFFSET, SHOT = (
         "shot noise", 0.005, "1, of the temporal variance by level",
         "healthy sets: 1 % is not excluded",
     ),
+    GroupDeclaration(
+        "borders of cells", 0.05, "1, of the exponent of a screen's light by its drive",
+        "a picture's file doesn't state how wide a screen draws the borders of cells: drawn with samples of 1/3 px, "
+        "they have an exponent of 0.86",
+    ),
 )  # fmt: skip
 ON_OBSERVABLES = (
     GroupDeclaration(
@@ -96,7 +106,7 @@ ON_OBSERVABLES = (
     ),
     GroupDeclaration(
         "gain by line", 0.00005, "1, of the observable's scale", "healthy sets of two simulators",
-        observables=("green_balance", "flat_lines", "row_periods", "line_gains"),
+        observables=("green_balance", "flat_lines", "row_periods", "line_gains", "flat_pattern"),
     ),
     GroupDeclaration(
         "screens", 0.001, "1, of the observable's scale", "screens drawn to 1/55 px; drawn to 1/25 px they leave 0.7 %",
@@ -206,7 +216,7 @@ def _directed(shape: str, at: Sequence[float]) -> _SmoothChange:
 
 
 def _transfer(dataset: Dataset) -> Iterator[_SmoothChange]:
-    at = (np.linspace(0.0, 1.0, 8) / dataset.camera.pixel_pitch_um).tolist()
+    at = (np.array(_TRANSFER_NODES) / dataset.camera.pixel_pitch_um).tolist()
     yield _curve("image", "frequency", "mean", at, first=1)
     for shape in ("astigmatic", "diagonal", "chromatic"):
         yield _directed(shape, at)
@@ -262,9 +272,13 @@ def _shot(dataset: Dataset) -> Iterator[_SmoothChange]:
     yield _curve("charge", "level", "variance", _levels_e(dataset).tolist())
 
 
+def _borders(_dataset: Dataset) -> Iterator[_SmoothChange]:
+    yield _SmoothChange(lambda k, value: ScreenGamma(exponent=1.0 + value, rim_px=_RIMS_PX[k]), len(_RIMS_PX))
+
+
 _ON_STATES: dict[GroupDeclaration, Callable[[Dataset], Iterator[_SmoothChange]]] = {
     TRANSFER: _transfer, FIELD: _field, SPECTRAL: _spectral, RESPONSE: _response, SOURCE: _source, OFFSET: _offset,
-    SHOT: _shot,
+    SHOT: _shot, BORDERS: _borders,
 }  # fmt: skip
 
 

@@ -97,6 +97,8 @@ class Group:
 SCALES = 7
 #: Shares of the declared form tolerances: midpoints of equal shares of a standard half-normal distribution.
 FORM_SHARES = 3
+#: Probability that the laws of a set are wrong by several times what they declare, and by how many times.
+FORM_UNLISTED, FORM_BEYOND = 0.05, (3.0, 6.7)
 
 
 def _half_normal_quantile(share: FloatArray) -> FloatArray:
@@ -105,11 +107,34 @@ def _half_normal_quantile(share: FloatArray) -> FloatArray:
     return np.asarray(ndtri(0.5 + 0.5 * share))
 
 
-def form_scales(has_form_error: bool) -> tuple[float, ...]:
-    """Return the equally probable scales of form errors; 0 alone where nothing declares a tolerance."""
+@dataclass(frozen=True)
+class FormScale:
+    """A scale of form errors, as a multiple of the declared tolerances, and its log prior probability."""
+
+    share: float
+    log_prior: float
+
+    @property
+    def is_inexact(self) -> bool:
+        """Whether laws are wrong by more than they declare."""
+        return self.share > 1.0
+
+
+def everyday_forms(has_form_error: bool) -> tuple[FormScale, ...]:
+    """Return the everyday scales of form errors: equally probable points of a half-normal distribution; 0 alone where
+    nothing declares a tolerance."""
     if not has_form_error:
-        return (0.0,)
-    return tuple(_half_normal_quantile((np.arange(FORM_SHARES) + 0.5) / FORM_SHARES).tolist())
+        return (FormScale(0.0, 0.0),)
+    shares = _half_normal_quantile((np.arange(FORM_SHARES) + 0.5) / FORM_SHARES)
+    log_prior = float(np.log1p(-FORM_UNLISTED) - np.log(FORM_SHARES))
+    return tuple(FormScale(float(share), log_prior) for share in shares)
+
+
+def unlisted_forms() -> tuple[FormScale, ...]:
+    """Return the scales of form errors beyond everyday: equally probable points of a log-uniform distribution from 2
+    to 10 times the declared tolerance."""
+    log_prior = float(np.log(FORM_UNLISTED) - np.log(len(FORM_BEYOND)))
+    return tuple(FormScale(share, log_prior) for share in FORM_BEYOND)
 
 
 def with_columns(gaussian: Gaussian, columns: FloatArray) -> Gaussian:

@@ -6,7 +6,7 @@ mixtures over the sets of the conditional posteriors. The verdict: by these prob
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -49,7 +49,7 @@ class Size:
 @dataclass(frozen=True)
 class Posterior:
     """What the table says. `named`: effects, and families where no member is. `nothing`: p(no effect, nothing
-    unlisted)."""
+    unlisted). `inexact`: of each named effect, p(its law is wrong by more than it declares | the effect acts)."""
 
     findings: tuple[Finding, ...]
     named: tuple[Finding, ...]
@@ -57,6 +57,7 @@ class Posterior:
     sizes: Mapping[str, tuple[Size, ...]]
     left: float
     is_undecided: bool
+    inexact: Mapping[str, float] = field(default_factory=dict)
 
     def probability(self, kind: Kind, name: str) -> float:
         """Return the probability of a statement; 0 where the table doesn't hold it."""
@@ -96,7 +97,16 @@ def read_table(table: Table, hypotheses: Mapping[str, Hypothesis]) -> Posterior:
     held = {hypotheses[f.name].family for f in named}
     named += [f for f in findings if f.kind == "family" and f.probability >= NAMED and f.name not in held]
     sizes = {f.name: sizes_of(table, hypotheses, f.name) for f in named if f.kind == "effect"}
-    return Posterior(tuple(findings), tuple(named), nothing, sizes, table.left, table.is_undecided)
+    inexact = {name: inexact_probability(table, name) for name in sizes}
+    return Posterior(tuple(findings), tuple(named), nothing, sizes, table.left, table.is_undecided, inexact)
+
+
+def inexact_probability(table: Table, name: str) -> float:
+    """Return p(the laws of a set are wrong by more than they declare | the effect acts), over the refitted sets."""
+    held = [(row.probability, table.fits[row.members].inexact) for row in table.rows
+            if row.refitted and name in row.members]  # fmt: skip
+    total = sum(p for p, _ in held)
+    return sum(p * inexact for p, inexact in held) / total if total > 0.0 else 0.0
 
 
 def sizes_of(table: Table, hypotheses: Mapping[str, Hypothesis], name: str) -> tuple[Size, ...]:

@@ -218,10 +218,13 @@ def hypotheses_of(measured: MeasurementModel) -> dict[str, Hypothesis]:
     return found
 
 
-def search_side(problem: SideProblem, report: Callable[[str], None] = lambda text: None) -> tuple[Search, Table]:
-    """Run the search on one side."""
+def search_side(
+    problem: SideProblem, report: Callable[[str], None] = lambda text: None, everyday: float = 1.0
+) -> tuple[Search, Table]:
+    """Run the search on one side. `everyday`: factor to all everyday scales, to see what depends on them."""
     hypotheses = hypotheses_of(problem.measured)
-    model = SideModel(problem.measured, problem.groups)
+    groups = tuple(replace(group, everyday=everyday * group.everyday) for group in problem.groups)
+    model = SideModel(problem.measured, groups)
     prior = SetPrior({name: h.family for name, h in hypotheses.items()})
     search = Search(model, hypotheses, prior, report=report)
     return search, search.run()

@@ -39,14 +39,16 @@ from lab.inference.hypotheses import (
 )
 from lab.inference.laplace import Laplace, bounds, correct_along, integrate, near_bound
 from lab.inference.model import (
+    FormScale,
     Model,
     Point,
     ScaleIntegral,
     State,
+    everyday_forms,
     everyday_scales,
-    form_scales,
     log_sum_exp,
     scaled_columns,
+    unlisted_forms,
     with_columns,
 )
 from lab.observables.gaussian import Gaussian
@@ -78,6 +80,10 @@ PAIRS, TRIPLES, EXTENSIONS = 120, 12, 10
 NEAR = 3.0
 #: Scales of the groups, drawn from their posterior, over which a closed form is averaged.
 SCALES_AVERAGED = 7
+#: Departure from linearity, over the change, up to which a Jacobian is updated after a step, not differenced again.
+NEARLY_LINEAR = 0.3
+#: Log evidence by which the largest everyday form error has to exceed the next for larger ones to be tried.
+STEEP = 0.5
 #: Share of healthy draws whose p(nothing) is taken as that of a measured set, the lowest.
 REFINED = 0.03
 #: Gain of log evidence up to which a size may be near 0, where shapes vanish.
@@ -88,10 +94,11 @@ ALTERNATIVES_NEAR, MOST_ALTERNATIVES = 4.0, 2
 
 @dataclass(frozen=True)
 class FormFit:
-    """A fitted set with the form errors of its laws at one scale: log p(y | A) with the groups at their median everyday
-    scales (`base`), and the marginal likelihood of these scales, `start_log` there."""
+    """A fitted set with the form errors of its laws at one scale, whose log prior is `log_prior`: log p(y | A) with the
+    groups at their median everyday scales (`base`), and the marginal likelihood of these scales, `start_log` there."""
 
     form: float
+    log_prior: float
     base: float
     scales: ScaleIntegral
     start_log: float
@@ -109,7 +116,7 @@ class FormFit:
 
 @dataclass(frozen=True)
 class FittedSet:
-    """A refitted set at its mode, for each scale of form errors (equally probable). `jacobian` (n, p) of m by u at the
+    """A refitted set at its mode, for each scale of form errors. `jacobian` (n, p) of m by u at the
     mode; `others`: further modes of the posterior, which `shift` adds to the evidence of this one."""
 
     state: State
@@ -130,17 +137,17 @@ class FittedSet:
     @property
     def base(self) -> float:
         """Log p(y | A) with the groups at their median everyday scales."""
-        return self.shift + log_sum_exp([f.base for f in self.forms]) - float(np.log(len(self.forms)))
+        return self.shift + log_sum_exp([f.base + f.log_prior for f in self.forms])
 
     @cached_property
     def quick(self) -> float:
         """Log p(y | A), near enough to rank sets (`FormFit.quick`)."""
-        return self.shift + log_sum_exp([f.quick for f in self.forms]) - float(np.log(len(self.forms)))
+        return self.shift + log_sum_exp([f.quick + f.log_prior for f in self.forms])
 
     @cached_property
     def likeliest(self) -> FormFit:
         """The likeliest scale of form errors."""
-        return max(self.forms, key=lambda f: f.quick)
+        return max(self.forms, key=lambda f: f.quick + f.log_prior)
 
     @cached_property
     def by_groups(self) -> Mapping[frozenset[int], float]:
@@ -150,8 +157,15 @@ class FittedSet:
         sums: dict[frozenset[int], list[float]] = {}
         for form in near:
             for u, value in form.by_groups.items():
-                sums.setdefault(u, []).append(value)
-        return {u: self.shift + log_sum_exp(v) - float(np.log(len(self.forms))) for u, v in sums.items()}
+                sums.setdefault(u, []).append(value + form.log_prior)
+        return {u: self.shift + log_sum_exp(v) for u, v in sums.items()}
+
+    @property
+    def inexact(self) -> float:
+        """Probability that the laws are wrong by more than they declare, given the set."""
+        log = [f.quick + f.log_prior for f in self.forms]
+        beyond = [w for f, w in zip(self.forms, log, strict=True) if f.form > 1.0]
+        return float(np.exp(log_sum_exp(beyond) - log_sum_exp(log))) if beyond else 0.0
 
     @property
     def total(self) -> float:
@@ -406,8 +420,8 @@ class Search:
 
     def _log_density(self, state: State) -> float:
         """Log of p(y | u) p(u), everyday scales and form errors at their medians."""
-        forms = form_scales(self.model.has_form_error(state))
-        value = self._gaussian(state, forms[len(forms) // 2]).log_likelihood(self.model.value)
+        forms = everyday_forms(self.model.has_form_error(state))
+        value = self._gaussian(state, forms[len(forms) // 2].share).log_likelihood(self.model.value)
         places = coordinates_of(self.hypotheses, state)
         return value + sum(float(c.log_prior(float(u))) for (_, _, c), u in zip(places, stacked(state), strict=True))
 
@@ -435,8 +449,8 @@ class Search:
         y = self.model.value
         places = coordinates_of(self.hypotheses, state)
         coords = [c for _, _, c in places]
-        forms = form_scales(self.model.has_form_error(state))
-        middle = forms[len(forms) // 2]
+        forms = everyday_forms(self.model.has_form_error(state))
+        middle = forms[len(forms) // 2].share
         u = stacked(state)
         if len(u):
             for most in EVALUATIONS:
@@ -448,19 +462,26 @@ class Search:
         jacobian = self._jacobian(state, coords, u, mean)
         own = sum(self.hypotheses[name].log_prior(point) for name, point in state.items())
         precision, pull = _normal_prior(coords, u)
-        fits, found = [], None
-        for form in forms:
-            bare = self.model.gaussian(state, form)
+        fits: list[FormFit] = []
+        found: Laplace | None = None
+
+        def add(form: FormScale) -> Laplace:
+            bare = self.model.gaussian(state, form.share)
             gaussian = with_columns(bare, self._everyday)
             white = gaussian.whiten(np.column_stack([jacobian, y - mean]))
-            table, r = white[:, :-1], white[:, -1]
-            laplace = self._integral(state, coords, u, gaussian, table, r)
-            if form == middle:
-                found = laplace
+            laplace = self._integral(state, coords, u, gaussian, white[:, :-1], white[:, -1])
             scales = ScaleIntegral.of(bare, y - mean, self.model.groups, jacobian, precision, pull, self.any_unlisted)
             start_log = scales.log_likelihood(everyday_scales(self.model.groups))
             base = own + gaussian.log_likelihood(y) + laplace.log_integral
-            fits.append(FormFit(form, base, scales, start_log))
+            fits.append(FormFit(form.share, form.log_prior, base, scales, start_log))
+            return laplace
+
+        for form in forms:
+            laplace = add(form)
+            found = laplace if form.share == middle else found
+        if len(fits) > 1 and fits[-1].base > fits[-2].base + STEEP:  # else larger errors are less probable still
+            for form in unlisted_forms():
+                add(form)
         assert found is not None
         return FittedSet(state, tuple(coords), tuple(fits), found, jacobian, precision, pull)
 
@@ -471,14 +492,20 @@ class Search:
         low, high = bounds(coords)
         unit = np.array([c.unit for c in coords])
 
+        last: list[tuple[FloatArray, FloatArray, FloatArray]] = []  # u, whitened residual, whitened Jacobian
+
         def residual(at: FloatArray) -> FloatArray:
             white = gaussian.whiten(y - self.model.mean(moved(state, at)))
             return np.concatenate([white, [c.residual(float(x))[0] for c, x in zip(coords, at, strict=True)]])
 
         def slope(at: FloatArray) -> FloatArray:
             mean = self.model.mean(moved(state, at))
-            white = gaussian.whiten(self._jacobian(moved(state, at), coords, at, mean))
-            return np.vstack([-white, np.diag([c.residual(float(x))[1] for c, x in zip(coords, at, strict=True)])])
+            white = gaussian.whiten(y - mean)
+            table = _updated(last[0], at, white, unit) if last else None
+            if table is None:
+                table = -gaussian.whiten(self._jacobian(moved(state, at), coords, at, mean))
+            last[:] = [(at.copy(), white, table)]
+            return np.vstack([table, np.diag([c.residual(float(x))[1] for c, x in zip(coords, at, strict=True)])])
 
         inside = np.clip(u, low + 1e-9 * unit, high - 1e-9 * unit)
         found = least_squares(
@@ -563,7 +590,15 @@ class Search:
         for tau in scales.stratified(unlisted, SCALES_AVERAGED):
             z, square = self._linear(gram, tau)
             ratios.append(signature_log_odds(z, square, signatures))
-        return dict(zip(which, log_mean_exp(np.array(ratios)).tolist(), strict=True)) if which else {}
+        if not which:
+            return {}
+        found = log_mean_exp(np.array(ratios))
+        # several columns are integrated one after the other: only how that depends on the scales is taken from it
+        several = [k for k, s in enumerate(signatures) if len(s.columns) > 1]
+        z, square = self._linear(gram, scales.mode(unlisted))
+        found[several] -= signature_log_odds(z, square, [signatures[k] for k in several])
+        found[several] += [integrate_set(z, square, [signatures[k]])[0] for k in several]
+        return dict(zip(which, found.tolist(), strict=True))
 
     def _near_alternatives(self, origin: FittedSet, owner: str, chosen: int) -> list[tuple[int, FloatArray]]:
         """Return other alternatives of a hypothesis that are nearly as likely as the one chosen."""
@@ -791,6 +826,20 @@ class Search:
         effects = {n: 1.0 - mass((n,)) / whole for n in gains}
         held = {f: 1.0 - mass(names) / whole for f, names in families.items()}
         return Tail(origin.members, origin.quick + float(np.log(whole)), effects, held)
+
+
+def _updated(
+    last: tuple[FloatArray, FloatArray, FloatArray], at: FloatArray, white: FloatArray, unit: FloatArray
+) -> FloatArray | None:
+    """Return the Jacobian (n, p) of a residual after a step that changed it nearly as the last Jacobian says (Broyden,
+    Math. Comp. 19, 577, 1965); None where it didn't."""
+    u, before, table = last
+    step, change = (at - u) / unit, white - before
+    off = change - table @ (at - u)
+    square = float(step @ step)
+    if square == 0.0 or np.linalg.norm(off) > NEARLY_LINEAR * np.linalg.norm(change):
+        return table if square == 0.0 else None
+    return np.asarray(table + np.outer(off, step / unit) / square)
 
 
 def _differ(one: FittedSet, other: FittedSet) -> bool:

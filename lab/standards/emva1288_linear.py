@@ -15,7 +15,7 @@ from lab.formats.results import Emva1288
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation
 from lab.formats.results.words import measured
-from lab.standards.standard import Figure, MeasuredSide, Standard
+from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
 
 LEAST_LEVELS = 50
 LEAST_STACK_IMAGES = 16
@@ -42,6 +42,26 @@ class Emva1288Linear(Standard):
 
     name: ClassVar[str] = "EMVA 1288 R4.0 Linear"
     title: ClassVar[str] = "sensitivity, noise, linearity and nonuniformity of a linear camera"
+    target: ClassVar[str] = (
+        "flats of 50 levels up to saturation with darks of the same exposures, stacks of 16 dark images and "
+        "of 16 at half of saturation"
+    )
+    compared: ClassVar[str] = (
+        "emva1288 1.0.2 (`benchmarks/test_noise.py`), on the real CCD set K within 0.5 % and PRNU within 1 %"
+    )
+    not_done: ClassVar[tuple[NotDone, ...]] = (
+        NotDone(
+            "3.2",
+            "dependence of the dark current on temperature",
+            "of the fit (`dark_current_temperature`), not read here",
+        ),
+        NotDone("9", "spectral sensitivity", "of the spectral fit, not read here"),
+        NotDone(
+            "4.4",
+            "defect pixel characterisation",
+            "histograms are drawn; no thresholds of an application are stated",
+        ),
+    )
 
     def __init__(self, side: MeasuredSide, plane: str, own: Emva1288) -> None:
         super().__init__(side, f"plane {plane}")

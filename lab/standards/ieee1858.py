@@ -18,7 +18,7 @@ from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, PlotCurve, StandardPlot
 from lab.observables.edges.finding import Array
 from lab.standards.iso12233 import EdgeRecord, edge_records
-from lab.standards.standard import Figure, MeasuredSide, Standard
+from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
 
 #: Contrast sensitivity a f^c exp(-b f) / K, f in cycles per degree.
 CSF_A, CSF_B, CSF_C, CSF_K = 75.0, 0.2, 0.8, 34.05
@@ -91,6 +91,12 @@ class Ieee1858(Standard):
 
     name: ClassVar[str] = "IEEE 1858-2016 (CPIQ)"
     title: ClassVar[str] = "acutance of a slanted edge for stated viewing conditions"
+    target: ClassVar[str] = "slanted edges"
+    compared: ClassVar[str] = "no peer on the package index; the integral of the contrast sensitivity in closed form"
+    not_done: ClassVar[tuple[NotDone, ...]] = (
+        NotDone("5.4", "quality loss in JND", "the text of the standard was not at hand"),
+        NotDone("6", "texture blur, chroma level, local distortion", "need a dead-leaves chart"),
+    )
 
     def __init__(self, side: MeasuredSide, edge: EdgeRecord) -> None:
         super().__init__(side, edge.name)

@@ -17,7 +17,7 @@ from lab.errors import NotDetermined
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, PlotCurve, StandardPlot
 from lab.standards.iso17321 import GRID_NM, Colorimetry
-from lab.standards.standard import Figure, MeasuredSide, Standard
+from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
 from sim.scene.light import colour_science, luminance_cd_m2
 from sim.spectrum import Spectrum
 
@@ -30,6 +30,15 @@ class Iso13655(Standard):
 
     name: ClassVar[str] = "ISO 13655:2017"
     title: ClassVar[str] = "colorimetry of the light"
+    target: ClassVar[str] = "the radiance of the light, measured twice or more"
+    compared: ClassVar[str] = "colour-science 0.4.7: observer, correlated colour temperature"
+    not_done: ClassVar[tuple[NotDone, ...]] = (
+        NotDone(
+            "5",
+            "reflectance and density of samples",
+            "no reflectances are measured; spectra go in and out as CGATS.17 text by `calibench import` and `export`",
+        ),
+    )
 
     def __init__(self, side: MeasuredSide, kind: str, spectra: list[Spectrum]) -> None:
         super().__init__(side, f"light of the {kind} captures")

@@ -11,7 +11,7 @@ from lab.errors import NotDetermined
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, PlotCurve, StandardPlot
 from lab.formats.results.words import measured
-from lab.standards.standard import Figure, MeasuredSide, Standard
+from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
 from lab.standards.tone_steps import ToneSteps, tone_steps
 
 LEAST_STEPS = 12
@@ -29,6 +29,16 @@ class Iso14524(Standard):
 
     name: ClassVar[str] = "ISO 14524:2009"
     title: ClassVar[str] = "opto-electronic conversion function (OECF) of the focal plane"
+    target: ClassVar[str] = "flats of 12 levels in 10 repeats"
+    compared: ClassVar[str] = "no peer on the package index; closed forms in the tests"
+    not_done: ClassVar[tuple[NotDone, ...]] = (
+        NotDone(
+            "5.3",
+            "camera OECF of a chart of grey steps",
+            "needs a chart of 12 steps or more; a ColorChecker has six",
+        ),
+        NotDone("6.4", "OECF by colour temperature", "needs light of two illuminants"),
+    )
 
     def __init__(self, side: MeasuredSide, steps: ToneSteps) -> None:
         super().__init__(side, f"plane {steps.plane}")

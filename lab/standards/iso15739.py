@@ -12,7 +12,7 @@ from lab.errors import NotDetermined
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, PlotCurve, StandardPlot
 from lab.formats.results.words import measured
-from lab.standards.standard import Figure, MeasuredSide, Standard
+from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
 from lab.standards.tone_steps import ToneSteps, tone_steps
 
 LEAST_IMAGES = 8
@@ -27,6 +27,15 @@ class Iso15739(Standard):
 
     name: ClassVar[str] = "ISO 15739:2023"
     title: ClassVar[str] = "noise, signal-to-noise ratios and dynamic range"
+    target: ClassVar[str] = "flats in 8 repeats, and darks"
+    compared: ClassVar[str] = "no peer on the package index; closed forms in the tests"
+    not_done: ClassVar[tuple[NotDone, ...]] = (
+        NotDone(
+            "Annex B",
+            "visual noise",
+            "the annex's text was not at hand; the normalisation of its contrast sensitivities sets the scale",
+        ),
+    )
 
     def __init__(self, side: MeasuredSide, steps: ToneSteps) -> None:
         super().__init__(side, f"plane {steps.plane}")

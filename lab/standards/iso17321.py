@@ -23,7 +23,7 @@ from lab.formats.results import SpectralFit
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation
 from lab.observables.charts.patches import patch_covariance, patch_levels
-from lab.standards.standard import Figure, MeasuredSide, Standard
+from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
 from sim.scene.colorchecker import reflectances
 from sim.scene.light import colour_science
 from sim.spectrum import FloatArray, Spectrum
@@ -132,6 +132,11 @@ class Iso17321(Standard):
 
     name: ClassVar[str] = "ISO 17321-1:2012"
     title: ClassVar[str] = "colour characterisation: sensitivity metamerism index and colour matrix"
+    target: ClassVar[str] = "narrowband light over 380 to 780 nm, or a ColorChecker in daylight"
+    compared: ClassVar[str] = (
+        "colour-science 0.4.7: test colours, observer, illuminants; CIELAB differences equal to 1e-9"
+    )
+    not_done: ClassVar[tuple[NotDone, ...]] = (NotDone("5.2", "sensitivities themselves", "of the spectral fit"),)
 
     def __init__(self, side: MeasuredSide, subject: str, fitted: ColourMatrix, drawn: list[ColourMatrix]) -> None:
         super().__init__(side, subject)

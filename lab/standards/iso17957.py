@@ -12,7 +12,7 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, StandardMap
-from lab.standards.standard import Figure, MeasuredSide, Standard
+from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
@@ -62,6 +62,9 @@ class Iso17957(Standard):
 
     name: ClassVar[str] = "ISO 17957:2015"
     title: ClassVar[str] = "luminance and colour shading"
+    target: ClassVar[str] = "flats of one level"
+    compared: ClassVar[str] = "no peer on the package index; closed forms in the tests"
+    not_done: ClassVar[tuple[NotDone, ...]] = (NotDone("6", "shading in CIELAB", "needs a finished image in sRGB"),)
 
     def __init__(self, side: MeasuredSide, blocks: Blocks) -> None:
         super().__init__(side, "whole frame")

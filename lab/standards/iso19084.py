@@ -19,6 +19,8 @@ class Iso19084(Standard):
 
     name: ClassVar[str] = "ISO 19084:2015"
     title: ClassVar[str] = "chromatic displacement"
+    target: ClassVar[str] = "views of a ChArUco board with a colour camera"
+    compared: ClassVar[str] = "no peer on the package index; closed forms in the tests"
 
     def __init__(self, side: MeasuredSide, channel: ChannelGeometry) -> None:
         super().__init__(side, f"{channel.channel} against G")

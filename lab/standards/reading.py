@@ -42,6 +42,25 @@ STANDARDS: dict[str, Callable[[MeasuredSide], Iterator[Standard]]] = {
 }
 
 
+def standard_kinds() -> tuple[type[Standard], ...]:
+    """Return the class of each standard, in the order of the report; that of the frame after that of its edges."""
+    return (
+        emva1288_linear.Emva1288Linear,
+        emva1288_general.Emva1288General,
+        iso12233.Iso12233,
+        iso12233.Iso12233Field,
+        ieee1858.Ieee1858,
+        iso14524.Iso14524,
+        iso15739.Iso15739,
+        iso17321.Iso17321,
+        iso17850.Iso17850,
+        iso19084.Iso19084,
+        iso17957.Iso17957,
+        iso18844.Iso18844,
+        iso13655.Iso13655,
+    )
+
+
 def read_standards(
     recordings: RecordingSet, fit: FitResult, progress: Callable[[str, float], None] | None = None
 ) -> StandardsResult:
@@ -59,7 +78,12 @@ def read_standards(
             if progress is not None:
                 progress(f"{name}, {side}", (number * len(STANDARDS) + place) / total)
             try:
-                readings += [standard.read() for standard in read(measured)]
+                for standard in read(measured):
+                    try:
+                        readings.append(standard.read())
+                    except NotDetermined as refused:
+                        reason = f"{standard.subject}: {refused.reason}"
+                        skipped.append(Skipped(step=name, reason=reason, side=side))
             except NotDetermined as refused:
                 skipped.append(Skipped(step=name, reason=refused.reason, side=side))
     return StandardsResult(source=recordings.source, readings=tuple(readings), skipped=tuple(skipped))

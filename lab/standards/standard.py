@@ -90,13 +90,27 @@ class MeasuredSide:
         )
 
 
+@dataclass(frozen=True)
+class NotDone:
+    """A figure of a standard that isn't computed, and why, or with which target it would be."""
+
+    clause: str
+    figure: str
+    why: str
+
+
 class Standard:
     """A standard, read on one subject.
 
-    `name`: number and year; `title`: what it measures. Subclasses add figures, and override what they have."""
+    `name`: number and year; `title`: what it measures; `target`: what has to be captured; `compared`: the peer and its
+    version, and by how much the two differ; `not_done`: figures that the standard has and this class hasn't. Subclasses
+    add figures, and override what they have."""
 
     name: ClassVar[str]
     title: ClassVar[str]
+    target: ClassVar[str]
+    compared: ClassVar[str] = "no peer on the package index; closed forms in the tests"
+    not_done: ClassVar[tuple[NotDone, ...]] = ()
 
     def __init__(self, measured: MeasuredSide, subject: str) -> None:
         self.measured, self.subject = measured, subject

@@ -3,6 +3,7 @@ curves."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -20,8 +21,8 @@ from lab.observables.surroundings import halo_light
 from sim.effects.base import Effects
 from sim.point import even_share, wide_contrast
 from sim.scene.colorchecker import reflectances
-from sim.spectrum import FloatArray
-from sim.uniform import LEVEL, SPECTRAL, FieldPoints, Uniform
+from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import LEVEL, SPECTRAL, FieldPoints, Uniform, electron_rate
 
 #: Prior standard deviation of the light's level on the chart, and of its gradient from the middle to a side of the
 #: frame, relative.
@@ -59,6 +60,7 @@ def measure_chart(dataset: Dataset) -> Observable:
     )
     names = {n: i for i, n in enumerate(known)}
 
+    unmeasured = _unmeasured_rates(dataset, points, known)
     of_channel = {name: np.array([p.channel == name for p in points]) for name in dataset.channels}
 
     def predict(effects: Effects) -> Prediction:
@@ -69,7 +71,7 @@ def measure_chart(dataset: Dataset) -> Observable:
         electrons = rates * model.field(place).light * (time + model.leaked_s(place))
         if model.strays:
             electrons = _strayed(points, electrons, place, model)
-        electrons = electrons * _mixing(dataset, points, electrons, model)
+        electrons = electrons * _mixing(points, electrons, model, unmeasured)
         veil = even_share(camera, effects) * surround + halo_light([p.around for p in points], effects, camera)
         electrons = wide_contrast(camera, effects) * electrons + (veil + tail) / noise.gain + ambient
         more = added_dark_dn(dataset, effects)
@@ -145,15 +147,38 @@ def _by_patch(points: list[Patch]) -> list[dict[str, int]]:
     return [*found.values()]
 
 
-def _mixing(dataset: Dataset, points: list[Patch], electrons: FloatArray, model: Uniform) -> FloatArray:
+def _unmeasured_rates(
+    dataset: Dataset, points: list[Patch], known: Mapping[str, Spectrum]
+) -> list[dict[str, float]]:  # fmt: skip
+    """Return, of every patch of every capture, the electron rates of the channels that have no pixels in its inner
+    part, over that of its first measured channel: neighbours of each pixel have them nevertheless."""
+    found = []
+    for members in _by_patch(points):
+        first, at = next(iter(members.items()))
+        light = dataset.spectrum(points[at].captures[0].radiance)
+
+        def rate(channel: str, light: Spectrum = light, reflectance: Spectrum = known[points[at].name]) -> float:
+            return electron_rate(dataset.camera, channel, light, kind="chart", reflectance=reflectance)
+
+        missing = [c for c in dataset.channels if c not in members]
+        found.append({c: rate(c) / max(rate(first), 1e-30) for c in missing} if missing else {})
+    return found
+
+
+def _mixing(
+    points: list[Patch], electrons: FloatArray, model: Uniform, unmeasured: list[dict[str, float]]
+) -> FloatArray:  # fmt: skip
     """Factors (n,) on the patches' electrons by effects that move charge between neighbouring pixels of different
     channels."""
     factor = np.ones(len(points))
-    for members in _by_patch(points):
-        if len(members) == len(dataset.channels):
-            mixed = model.mixing_factors({c: float(electrons[i]) for c, i in members.items()})
-            for c, i in members.items():
-                factor[i] = mixed.get(c, 1.0)
+    for members, others in zip(_by_patch(points), unmeasured, strict=True):
+        first = float(electrons[next(iter(members.values()))])
+        levels = {c: float(electrons[i]) for c, i in members.items()} | {
+            c: share * first for c, share in others.items()
+        }
+        mixed = model.mixing_factors(levels)
+        for c, i in members.items():
+            factor[i] = mixed.get(c, 1.0)
     return factor
 
 

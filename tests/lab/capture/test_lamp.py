@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,6 +14,7 @@ from drivers.errors import InstrumentError
 from drivers.light_source.base import LightSource
 from lab.capture.devices import LampDevice
 from lab.capture.plan import CapturePlan, full_plan
+from lab.capture.safe_at_start import Rescue
 from lab.capture.session import CaptureSession
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
@@ -257,4 +260,27 @@ def test_a_capture_in_the_lamps_light_is_as_hashable_as_any_other(tmp_path: Path
     captures = store.recording_set(session.id).captures()
     assert len(set(captures)) == len(captures) == len({hash(one) for one in captures})
     assert hash(captures[0]) == hash(captures[0].model_copy())
+    store.close()
+
+
+def test_a_lamp_that_a_crash_left_lit_goes_dark_at_the_next_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, bench = Store(tmp_path / "data"), LampBench()
+    session = started(store, CapturePlan((FLAT,)), bench)
+    store.set_state(session.id, "running")  # and its process is gone
+    bench.lamp.shares["red"] = 0.4
+    by_address = {**bench.drivers().all, **bench.drivers().cameras, "lamp": bench.lamp}
+
+    def driver(family: str, name: str) -> Callable[..., Any]:
+        return lambda address, **settings: by_address[address] if not settings else None
+
+    monkeypatch.setattr("lab.capture.safe_at_start.driver", driver)
+    rescue = Rescue(store.root)
+    rescue.stop_others(30.0)
+    safe = rescue.made_safe(30.0)
+    assert list(safe) == [session.id]  # the lights of the station file are no setting of the driver
+    assert bench.lamp.shares == dict.fromkeys(bench.lamp.shares, 0.0)
+    for lock in safe.values():
+        lock.release()
     store.close()

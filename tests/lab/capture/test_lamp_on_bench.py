@@ -18,6 +18,7 @@ from lab.capture.station import Station
 from lab.capture.store import Store
 from lab.capture_kinds.flat import FlatSequence
 from lab.formats.recording_set import RecordingSet, inspect
+from lab.formats.recording_set.checks import clipped_share, flat_level
 from mocks.bench import Bench
 from mocks.conceal import Concealed
 from mocks.cornerstone260 import MockCornerstone260
@@ -36,7 +37,7 @@ SHAPE = (60, 80)
 
 class LampStation:
     """A bench of small frames with its light source, radiometer, stage and left camera on lines, and their station;
-    `monochromator`: with one."""
+    `monochromator`: with one. `real_time_factor`: of the bench's clock."""
 
     def __init__(
         self,
@@ -46,8 +47,9 @@ class LampStation:
         concealed: Concealed | None = None,
         shape: tuple[int, int] = SHAPE,
         monochromator: bool = False,
+        real_time_factor: float = 0.0,
     ) -> None:
-        self.place = Bench(seed=3, concealed=concealed or {}, shape=shape, session_clock=time.time)
+        self.place = Bench(3, real_time_factor, concealed or {}, shape=shape, session_clock=time.time)
         self.lamp = MockPe4000(self.place)
         stop = threading.Event()
         running.callback(stop.set)
@@ -111,7 +113,14 @@ def test_level_and_colour_temperature_change_what_the_camera_sees(
     assert session.run().state == "finished"
     assert there.is_dark()
     recordings = store.recording_set(session.id)
-    assert inspect(recordings)[0] == []
+    problems, warnings = inspect(recordings)
+    assert problems == [] and not any("contradicts" in line for line in warnings)
+    camera = recordings.camera("left")
+    levels = [
+        flat_level(recordings, f, clipped_share(recordings.codes(f), camera)) for f in recordings.captures("flat")
+    ]
+    # total radiances of two spectra aren't comparable
+    assert {level.scale for level in levels} == {"radiance of 3000 K", "radiance of 6500 K"}
     full, exposure_s = _electrons_per_s(recordings, 3000.0, 0.90)
     half, longer_s = _electrons_per_s(recordings, 3000.0, 0.45)
     cold, _ = _electrons_per_s(recordings, 6500.0, 0.90)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.standards.emva1288_general import CharacteristicCurve
+from lab.standards.emva1288_general import CharacteristicCurve, count_unsaturated
 
 GAIN, EFFICIENCY, READ_DN, FULL = 0.5, 0.6, 3.0, 3000.0
 PIXELS, REPEATS = 10_000, 2
@@ -89,3 +89,27 @@ def test_dark_alone_is_refused() -> None:
     curve = camera(light, 0.3 * light, 0.1 * light, FULL, None)
     with pytest.raises(NotDetermined, match="above 1; expose longer"):
         curve.threshold()
+
+
+def test_saturation_is_found_by_codes_by_levels_and_by_noise() -> None:
+    """Ten levels, the last three beyond saturation: at the highest code; at a full well below it, whose codes scatter
+    by the read-out; and a level that is about to saturate, of which half of the noise is cut off."""
+    mean = np.array([64.0, *(64.0 + 3000.0 * np.minimum(np.linspace(0.1, 1.3, 9), 1.0))])
+    variance = np.where(mean < 3060.0, 9.0 + 0.5 * (mean - 64.0), 9.0)
+    none, codes = np.zeros(10), np.where(mean > 3060.0, 1.0, 0.0)
+    assert count_unsaturated(mean, variance, codes) == count_unsaturated(mean, variance, none) == 7
+    cut = variance.copy()
+    cut[7] *= 0.5
+    near = mean.copy()
+    near[7] = 3050.0
+    assert count_unsaturated(near, cut, none) == 7
+
+
+def test_logarithmic_and_linear_levels_without_saturation() -> None:
+    """A logarithmic curve rises by 1 / 14 of its range in each decade: steps of 5 % of the light are 0.15 % of it."""
+    light = np.concatenate([[0.0], np.geomspace(1.0, 1e6, 283)])
+    assert (
+        count_unsaturated(300.0 * np.log1p(light / 50.0), np.full(light.size, 9.0), np.zeros(light.size)) == light.size
+    )
+    dim = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 40)])
+    assert count_unsaturated(3000.0 * dim, 9.0 + 1500.0 * dim, np.zeros(41)) == 41

@@ -19,6 +19,7 @@ from lab.formats.results import DiagnosisLists, NextCapture
 from lab.inference.hypotheses import SetPrior
 from lab.inference.posterior import Size
 from sim.camera import Side
+from sim.effects.axial_chromatic_aberration import AxialChromaticAberration
 from sim.effects.base import Effect
 from sim.effects.defocus import Defocus
 from sim.effects.source_drift import SourceDrift
@@ -120,6 +121,31 @@ def test_what_tells_nothing_settles_nothing() -> None:
     forecast = Forecast.of(np.zeros((2, 1)), none, none, np.eye(1))
     assert settling_probability([forecast], (0.6, 0.4), 0.95) == 0.0
     assert settling_probability([forecast], (0.96, 0.04), 0.95) == 1.0
+
+
+def test_sizes_that_one_side_cannot_tell_apart_are_reported_by_their_sum() -> None:
+    """Coordinates u = p^2 of 15 and 12 um with standard deviations of 100 um^2 and a correlation of -0.99: their sum
+    has sqrt(2 (1 - 0.99)) 100 = 14 um^2, and neither is determined."""
+    spread = 100.0**2 * np.array([[1.0, -0.99], [-0.99, 1.0]])
+    names, u = ("slope_um", "curvature_um"), np.array([150.0, 140.0])
+    cause = Cause(
+        name="axial_chromatic_aberration",
+        effect=AxialChromaticAberration(slope_um=12.0, curvature_um=12.0),
+        probability=0.99,
+        prior=PRIOR,
+        sizes=tuple(Size(name, 12.0, 5.0, (-6.0, 18.0), False) for name in names),
+        mean=u,
+        covariance=spread,
+        inexact=0.0,
+        shown_in=("slanted_edge",),
+    )
+    (named,) = merged_evidence("made up", [_side("left", cause)]).effects
+    (one,) = named.combinations
+    assert (one.side, one.parameters, one.power, one.unit) == ("left", names, 2, "um^2")
+    assert one.weights == pytest.approx((1.0, 1.0))
+    assert (one.value, one.std) == (pytest.approx(290.0), pytest.approx(100.0 * np.sqrt(0.02)))
+    assert "slope_um^2 + curvature_um^2 = 290 ± 14 um^2 is, of the left camera" in named.statement
+    assert not any(value.is_determined for value in named.parameters.values())
 
 
 def test_a_rival_without_an_effect_is_told_as_such() -> None:
