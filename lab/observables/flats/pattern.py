@@ -27,7 +27,7 @@ from sim.uniform import Uniform
 #: Bands of spatial frequency, cycles a pixel of a colour's plane; and that of the pixels' own pattern and noise.
 BAND_EDGES = 0.03, 0.05, 0.08, 0.125, 0.2
 OWN_BAND = 0.25, 0.45
-LEAST_PX = 48  # pixels of a plane a side: the lowest band holds ten frequencies
+LEAST_PX = 96  # pixels of a plane a side: the lowest band holds ten frequencies
 MOST_PX = 768  # of the middle of a plane that are read
 #: Sets of effects whose patterns are kept: a refit varies other effects' parameters beside the same pattern.
 CACHED_PATTERNS = 64
