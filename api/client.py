@@ -74,6 +74,7 @@ from lab.capture.catalogue import PlanEstimate, SequenceDescription
 from lab.capture.plan import Parameters
 from lab.capture.session import Progress
 from lab.diagnose.visibility import EffectDescription, ParameterDescription
+from lab.engine import DEFAULT_ENGINE, Engine
 from lab.errors import InputError, one_line
 from lab.formats.recording_set import RecordingSet, archive, read
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
@@ -607,13 +608,20 @@ class ServiceClient:
         """Delete a session for ever; its results and calibrations stay."""
         self.request("DELETE", f"/sessions/{session_id}")
 
-    def start_job(self, kind: JobKind, session_id: str, camera_model: str | None = None) -> Job:
-        """Start work on a finished session; validate and diagnose may begin with a `camera_model`."""
-        return self._post(Job, f"/sessions/{session_id}/jobs", JobStart(kind=kind, camera_model=camera_model))
+    def start_job(
+        self, kind: JobKind, session_id: str, camera_model: str | None = None, engine: Engine = DEFAULT_ENGINE
+    ) -> Job:
+        """Start work on a finished session; validate and diagnose may begin with a `camera_model`. `engine`: which one
+        diagnoses."""
+        start = JobStart(kind=kind, camera_model=camera_model, engine=engine)
+        return self._post(Job, f"/sessions/{session_id}/jobs", start)
 
-    def start_recordings_job(self, kind: JobKind, recordings_id: str, camera_model: str | None = None) -> Job:
+    def start_recordings_job(
+        self, kind: JobKind, recordings_id: str, camera_model: str | None = None, engine: Engine = DEFAULT_ENGINE
+    ) -> Job:
         """Start work on recordings that were sent in, as `start_job`."""
-        return self._post(Job, f"/recordings/{recordings_id}/jobs", JobStart(kind=kind, camera_model=camera_model))
+        start = JobStart(kind=kind, camera_model=camera_model, engine=engine)
+        return self._post(Job, f"/recordings/{recordings_id}/jobs", start)
 
     def follow_job(self, job_id: str) -> Iterator[Job]:
         """Yield a job as it changes, until it is over."""
@@ -640,9 +648,11 @@ class ServiceClient:
         """Wait until a job is over. Raises ServiceProblem unless it is done."""
         return self._ended(f"job {job_id}", lambda: self.job(job_id), ("done", "failed", "cancelled"), patience_s)
 
-    def _made(self, model: type[M], kind: JobKind, source: Source, patience_s: float) -> M:
+    def _made(
+        self, model: type[M], kind: JobKind, source: Source, patience_s: float, engine: Engine = DEFAULT_ENGINE
+    ) -> M:
         start = self.start_recordings_job if isinstance(source, Recordings) else self.start_job
-        job = self.wait_job(start(kind, _id_of(source)).id, patience_s)
+        job = self.wait_job(start(kind, _id_of(source), engine=engine).id, patience_s)
         return self._get(model, f"/jobs/{job.id}/result")
 
     def fit(self, source: Source, patience_s: float = PATIENCE_S) -> FitResult:
@@ -653,9 +663,12 @@ class ServiceClient:
         """Validate the fit of a finished session, or of recordings, and wait for the result."""
         return self._made(ValidationResult, "validate", source, patience_s)
 
-    def diagnose(self, source: Source, patience_s: float = PATIENCE_S) -> DiagnosisResult:
-        """Diagnose a finished session, or recordings that were sent in, and wait for the result."""
-        return self._made(DiagnosisResult, "diagnose", source, patience_s)
+    def diagnose(
+        self, source: Source, patience_s: float = PATIENCE_S, *, engine: Engine = DEFAULT_ENGINE
+    ) -> DiagnosisResult:
+        """Diagnose a finished session, or recordings that were sent in, and wait for the result. `engine`: `evidence`
+        or `today`."""
+        return self._made(DiagnosisResult, "diagnose", source, patience_s, engine)
 
     def findings(self, session_id: str) -> DiagnosisFindings:
         """Return what a session's newest diagnosis found, in words."""

@@ -33,6 +33,8 @@ from lab.capture.records import RunRecord
 from lab.capture.session import Progress
 from lab.capture.station import Station
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
+from lab.capture_kinds.lamp import LampLight
+from lab.engine import DEFAULT_ENGINE, Engine
 from lab.formats.importers import KINDS
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
 from lab.formats.results.diagnosis import DiagnosisVerdict
@@ -141,6 +143,9 @@ class StationState(Schema):
     cameras: tuple[Side, ...] = ()
     instruments: dict[str, str] = Field(default={}, description="family of the instrument -> its driver")
     targets: tuple[str, ...] = ()
+    lights: dict[str, LampLight] = Field(
+        default={}, description="of its light source, by name: what `lamp_level` and `colour_temperature_k` ask for"
+    )
     sequences: tuple[SequenceName, ...] = Field(default=(), description="what it has the instruments and targets for")
     busy_with: str | None = Field(default=None, description="id of a session that uses its instruments now")
     safety: StationSafety | None = Field(
@@ -571,6 +576,11 @@ class RecordedCapture(Schema):
 RESOLVE_MINUTES = Field(
     default=None, gt=0, le=1e5, description="with `resolve`: lab time that its captures may take, min; null: any"
 )
+ENGINE = Field(
+    default=DEFAULT_ENGINE,
+    description="what diagnoses: `evidence`, one table of sets of effects with their posterior probabilities; `today`, "
+    "the engine before it",
+)
 RESOLVE_ROUNDS = Field(
     default=None, ge=1, le=100, description="with `resolve`: how many captures it takes at most; null: 6"
 )
@@ -595,6 +605,7 @@ class JobStart(Asked):
     )
     resolve_minutes: float | None = RESOLVE_MINUTES
     resolve_rounds: int | None = RESOLVE_ROUNDS
+    engine: Engine = ENGINE
     camera_model: str | None = Field(
         default=None,
         pattern=r"^[0-9a-f]{16}$",
@@ -621,6 +632,7 @@ class PipelineStart(CaptureStart):
     )
     resolve_minutes: float | None = RESOLVE_MINUTES
     resolve_rounds: int | None = RESOLVE_ROUNDS
+    engine: Engine = ENGINE
 
 
 class PipelineResults(Schema):

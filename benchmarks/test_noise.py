@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.fit.noise.evaluation import fit_transfer
 from lab.fit.noise.noise_fit import fit_noise
+from lab.fit.noise.transfer import fit_transfer
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import NoiseFit

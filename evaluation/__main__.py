@@ -288,6 +288,48 @@ def engines_command(
         print(line, flush=True)
 
 
+@app.command("compare")
+def compare_command(
+    folder: Cases,
+    truths: TruthsFile,
+    page: Page = None,
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Diagnose tuning cases by both engines, and compare their proper scores in pairs. Results are kept in DIR.
+
+    Example: python -m evaluation compare cases --truths cases.truths.json
+    """
+    from evaluation.blind import BlindProof
+    from evaluation.calibrate import refuse_proof
+    from evaluation.page import placed
+    from evaluation.proper_scores import case_statements, comparison_table
+    from evaluation.score import broken_seals
+    from evaluation.sealed import sealed_cases
+    from evaluation.truth import Seals, Truths, load
+    from lab.engine import Engine
+
+    check_writable(page)
+    opened = load(Truths, truths)
+    refuse_proof(opened)
+    if opened.laws == "unlisted":
+        raise InputError(
+            f"{truths}: conceals laws that no list has; engines are compared on cases of `make` without it"
+        )
+    broken = broken_seals(folder, load(Seals, folder / "seals.json"), opened)
+    cases = tuple(case for case in sealed_cases(folder) if case not in broken)
+    engines: tuple[tuple[Engine, str], ...] = (("today", "results"), ("evidence", "results-evidence"))
+    told = {}
+    for engine, results in engines:
+        proof = BlindProof(folder, cases, truths, results=results, engine=engine)
+        runs = proof.run(folder, workers=_workers(jobs, scheduler), progress=_show_progress)
+        told[engine] = [case_statements(case, opened.truths[case].truth, run) for case, run in runs.items()]
+    text = comparison_table(told)  # type: ignore[arg-type]
+    print(text)
+    if page is not None:
+        page.write_text(placed(page.read_text(encoding="utf-8"), "engines", text), encoding="utf-8")
+
+
 @app.command("live")
 def live_command(
     out: Results,

@@ -13,10 +13,10 @@ from dataclasses import replace
 import numpy as np
 
 from evaluation.independent_simulator import WAVELENGTH_NM, ConcealedCamera, Law
-from lab.diagnose.inference.refit import Coordinate, coordinates
 from lab.diagnose.outcome.model_posterior import coordinate_name, with_unnamed
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import ModelPosterior
+from lab.inference.coordinates import EffectCoordinate, coordinates
 from lab.observables.flats.noise import GAIN_STD, READ_STD
 from lab.observables.spectra.curves import freed_curve
 from lab.twin.budget import USES, LinearUse, linear_use, with_darks
@@ -134,7 +134,7 @@ def _errors(
     return found
 
 
-def _true_value(effect: Effect, coordinate: Coordinate, laws: Sequence[Law]) -> float | None:
+def _true_value(effect: Effect, coordinate: EffectCoordinate, laws: Sequence[Law]) -> float | None:
     """Truth less model of an effect's parameter, in its coordinate; None where the law that acts has no such
     parameter."""
     law = next((one for one in laws if one.effect == effect.name), None)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from evaluation.experiment import CaseResult
 from lab.diagnose.policy import DecisionPolicy
+from lab.engine import DEFAULT_ENGINE, Engine
 from lab.formats.results import DiagnosisResult
 
 
@@ -33,7 +34,7 @@ def _peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def run_case(folder: Path, policy: DecisionPolicy | None = None) -> CaseRun:
+def run_case(folder: Path, policy: DecisionPolicy | None = None, engine: Engine = DEFAULT_ENGINE) -> CaseRun:
     """Diagnose the recording set in `folder`. `policy`: the rules of decision; None: the default ones. An exception
     becomes `error`."""
     from lab.diagnose import examine
@@ -44,7 +45,7 @@ def run_case(folder: Path, policy: DecisionPolicy | None = None) -> CaseRun:
     wall, cpu = time.perf_counter(), time.process_time()
     found, error = None, None
     try:
-        result = examine(recording.read(folder), at_once=False, policy=policy).result
+        result = examine(recording.read(folder), at_once=False, policy=policy, engine=engine).result
         found = result.model_copy(update={"curves": (), "source": folder.name})
     except Exception as caught:  # any error is the result of its case
         at = traceback.extract_tb(caught.__traceback__)[-1]

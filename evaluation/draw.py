@@ -25,6 +25,7 @@ from evaluation.independent_simulator import (
     record_pair,
 )
 from evaluation.noncentrality import FairStrength, fair_strengths, library_changes, noncentrality, summaries
+from evaluation.rig_errors import RigErrors
 from evaluation.truth import SIZES, CaseTruth, Concealed, Kind
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.formats.recording_set import Manifest, RecordingSet
@@ -187,7 +188,7 @@ class DrawnFrame:
 
 def draw(
     seed: int, index: int, size: str = "medium", *, cfa: str | None = None, kind: Kind | None = None,
-    law: type[Law] | None = None, sizing: Sizing = "aimed"
+    law: type[Law] | None = None, sizing: Sizing = "aimed", rig: RigErrors | None = None
 ) -> Case:  # fmt: skip
     """Return case number `index` of a seed; the same arguments give the same case.
 
@@ -197,6 +198,7 @@ def draw(
                       above what is needed to see them. "nominal": they have their nominal strength, and the
                       non-centrality is taken from one draw of the noise, which is quick and too high. "unmeasured":
                       they have their nominal strength, and 0 stands for the non-centrality
+    rig       errors of chart and radiometer; None: they have none
     """
     rng = np.random.default_rng([seed, index])
     what = kind or kind_of(seed, index)
@@ -212,6 +214,8 @@ def draw(
         screen_cell_px=frame.screen_cell_px,
         screen_turn_deg=frame.screen_turn_deg,
     )
+    if rig is not None:
+        plan = replace(plan, chart=rig.reflectances, reading=rig.reading)
     healthy = ConcealedCamera(camera_seed, cfa=cfa, rows=rows, cols=cols)
     dealer = _Dealer(seed, index, rng, healthy.cfa)
     laws: list[Law] = []

@@ -160,6 +160,7 @@ SIZES: dict[str, str] = {
     "defocus": "left:defocus_um=22",
     "distortion": "left:corner_percent=1.5",
     "empirical_law": "both:strength=1",
+    "etaloning": "left:strength_percent=20,thickness_um=4",
     "excess_noise": "left:excess_percent=60",
     "exposure_offset": "left:offset_us=25",
     "field_curvature": "left:curvature_um=25",
@@ -170,6 +171,7 @@ SIZES: dict[str, str] = {
     "image_lag": "left:lag_percent=2",
     "infrared_cut_filter": "left:cut_wavelength_nm=655,width_nm=4",
     "inter_pixel_capacitance": "left:share_percent=2",
+    "lamp_ageing": "both:reddening_percent=12",
     "lateral_chromatic_aberration": "left:slope_um=2.5",
     "light_flicker": "both:modulation_percent=8,frequency_hz=100,line_time_us=20",
     "microlens_angle": "left:crosstalk_percent=3,loss_percent=4",
@@ -202,6 +204,7 @@ SIZES: dict[str, str] = {
     "secondary_astigmatism": "left:cos_um=0.2",
     "secondary_coma": "left:cos_um=0.2",
     "tetrafoil": "left:cos_um=0.25",
+    "tree_rings": "left:amplitude_percent=0.8,period_um=30",
     "trefoil": "left:w333_x_um=0.2",
     "turbulent_air": "left:width_um=1.5",
     "veiling_glare": "left:share_percent=3",
@@ -262,8 +265,9 @@ NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
 NOT_SHOWN_BY_BENCH = frozenset({"second_order_light", "stereo_time_offset"})
 
 #: Effects that one session can't show: distortion is fitted to its boards, so that only an earlier calibration shows a
-#: change; and it takes its dark frames before any light, so that nothing persists in them.
-NOT_IN_ONE_SESSION = frozenset({"distortion", "decentre", "persistence"})
+#: change; it takes its dark frames before any light, so that nothing persists in them; and the bench's cameras have
+#: filters that keep near-infrared light out.
+NOT_IN_ONE_SESSION = frozenset({"distortion", "decentre", "etaloning", "persistence"})
 
 
 class LiveCase(Frozen):

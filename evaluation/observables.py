@@ -24,6 +24,8 @@ from scipy.stats import kstest
 
 from evaluation.draw import draw
 from evaluation.own_chain import healthy_session
+from evaluation.rig_errors import RigErrors
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.side_model import measurement_model
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet
@@ -41,8 +43,9 @@ CHANCE = 0.01
 
 
 def of_second_simulator(number: int) -> RecordingSet:
-    """Return healthy set `number` of the second simulator."""
-    return draw(SEED, number, "small" if number % 2 else "medium", kind="healthy", sizing="unmeasured").recordings
+    """Return healthy set `number` of the second simulator, of a rig within its tolerances."""
+    size = "small" if number % 2 else "medium"
+    return draw(SEED, number, size, kind="healthy", sizing="unmeasured", rig=RigErrors(SEED, number)).recordings
 
 
 #: Healthy sets by the simulator that draws them.
@@ -84,12 +87,22 @@ def _kept(file: Path) -> Iterator[Calibrated]:
             yield from (Calibrated(**one) for one in json.loads(line))
 
 
-def _of_set(source: str, number: int) -> Iterator[Calibrated]:
-    """Yield chi2 and n of every observable of the left camera, and of all together."""
-    recordings = SOURCES[source](number)
-    model, _ = measurement_model(recordings, "left", fit_recording_set(recordings))
-    if model is None:
-        return
+@dataclass(frozen=True)
+class Scatter:
+    """How the numbers of one observable scatter about their prediction; "all": those of all together.
+
+    `chi2` of `n` directions: without those that wide nuisance parameters take. `pull`: the mean of the numbers, each
+    over its standard deviation, over that mean's standard deviation, nuisance parameters in it.
+    """
+
+    observable: str
+    chi2: float
+    n: int
+    pull: float
+
+
+def scatter(model: MeasurementModel) -> Iterator[Scatter]:
+    """Yield the scatter of every observable of a model about the prediction without effects, and of all together."""
     away = model.value - model.mean()
     nuisances = np.reshape(list(model.nuisance_jacobian().values()), (-1, len(away))).T
     white, own = [], []
@@ -97,8 +110,23 @@ def _of_set(source: str, number: int) -> Iterator[Calibrated]:
         whiten = _whitening(block.covariance)
         white.append(whiten @ away[at])
         own.append(whiten @ nuisances[at])
-        yield Calibrated(source, number, block.measurement.name, *_chi2(white[-1], own[-1]))
-    yield Calibrated(source, number, "all", *_chi2(np.concatenate(white), np.concatenate(own)))
+        yield Scatter(
+            block.measurement.name, *_chi2(white[-1], own[-1]), _pull(away[at], block.covariance, nuisances[at])
+        )
+    yield Scatter("all", *_chi2(np.concatenate(white), np.concatenate(own)), float("nan"))
+
+
+def _pull(away: FloatArray, covariance: FloatArray, nuisances: FloatArray) -> float:
+    weight = 1.0 / np.sqrt(np.diag(covariance) + np.sum(np.square(nuisances), axis=1))
+    return float(weight @ away / np.sqrt(weight @ covariance @ weight + np.sum(np.square(weight @ nuisances))))
+
+
+def _of_set(source: str, number: int) -> Iterator[Calibrated]:
+    """Yield chi2 and n of every observable of the left camera, and of all together."""
+    recordings = SOURCES[source](number)
+    model, _ = measurement_model(recordings, "left", fit_recording_set(recordings))
+    for one in scatter(model) if model is not None else ():
+        yield Calibrated(source, number, one.observable, one.chi2, one.n)
 
 
 def _whitening(covariance: FloatArray) -> FloatArray:

@@ -6,13 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lab.diagnose.reference_study import reference_camera, reference_study
+from evaluation.rig_errors import RigErrors
+from lab.diagnose.reference_study import WAVELENGTH_NM, reference_camera, reference_study
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Cfa, Lens
+from sim.scene import colorchecker
+from sim.spectrum import Spectrum
 
 
 def healthy_session(seed: Sequence[int]) -> RecordingSet:
-    """Return the session of a camera whose mosaic, depth, gain, noise and aperture are drawn."""
+    """Return the session of a camera whose mosaic, depth, gain, noise and aperture are drawn, at a rig whose chart and
+    radiometer are wrong within their tolerances."""
     rng = np.random.default_rng(seed)
     camera = reference_camera()
     bits = int(rng.choice([10, 12, 14]))
@@ -35,4 +39,7 @@ def healthy_session(seed: Sequence[int]) -> RecordingSet:
             "lens": Lens(f_number=float(rng.choice([2.8, 4.0, 5.6])), focal_length_mm=camera.lens.focal_length_mm),
         }
     )
-    return reference_study(int(rng.integers(2**31)), drawn)
+    rig = RigErrors(*seed)
+    published = np.array([patch.at(WAVELENGTH_NM) for patch in colorchecker.reflectances("ColorChecker24").values()])
+    own = tuple(Spectrum.of(WAVELENGTH_NM, patch) for patch in rig.reflectances(WAVELENGTH_NM, published))
+    return reference_study(int(rng.integers(2**31)), drawn, reflectances=own, reading=rig.reading)

@@ -13,6 +13,7 @@ from evaluation.experiment import Experiment, ScoredExperiment
 from evaluation.score import SealedScore, broken_seals
 from evaluation.truth import Seals, Truths, load
 from lab.diagnose.policy import DecisionPolicy
+from lab.engine import DEFAULT_ENGINE, Engine
 
 S = TypeVar("S", bound=SealedScore)
 
@@ -22,7 +23,7 @@ class SealedExperiment(Experiment[Path, CaseRun], Generic[S]):
     """Cases in a folder that `make` wrote; their truths are opened after the last diagnosis.
 
     cases: names; truths: their file, for the scores; policy: rules of decision, None: the default ones; results:
-    folder of the results below that of the cases.
+    folder of the results below that of the cases; engine: what diagnoses.
     """
 
     result = CaseRun
@@ -32,6 +33,7 @@ class SealedExperiment(Experiment[Path, CaseRun], Generic[S]):
     truths: Path | None = None
     policy: DecisionPolicy | None = None
     results: str = "results"
+    engine: Engine = DEFAULT_ENGINE
 
     def draw(self) -> dict[str, Path]:
         """Return the folder of each case."""
@@ -39,7 +41,7 @@ class SealedExperiment(Experiment[Path, CaseRun], Generic[S]):
 
     def diagnose(self, case: Path, folder: Path) -> CaseRun:
         """Diagnose the recording set of a case."""
-        return run_case(case, self.policy)
+        return run_case(case, self.policy, self.engine)
 
     def file(self, out: Path, name: str) -> Path:
         """Return where the result of a case is kept."""

@@ -15,6 +15,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+from lab.engine import DEFAULT_ENGINE, Engine
 from lab.errors import InputError, NotDetermined
 from lab.progress_bar import progress_bar
 from lab.shown import Presenter, present_with
@@ -179,6 +180,7 @@ def diagnose(
     fit: FitResult | None = None,
     *,
     cameras: Mapping[Side, CameraFile] | None = None,
+    engine: Engine = DEFAULT_ENGINE,
     progress: bool | None = None,
 ) -> DiagnosisResult:
     """Find the physics that the camera model leaves out.
@@ -186,6 +188,7 @@ def diagnose(
     recordings : a recording set, or what `open_recordings` opens
     fit : the recordings' fit; None: it is made
     cameras : camera models by side to begin with, in place of the fitted ones
+    engine : `evidence`, one table of sets of effects with their posterior probabilities; `today`, the engine before it
     progress : show a bar; None: on a terminal and in a notebook
 
     Returns the verdict, the effects with their probabilities and parameters, and how much better held-out captures are
@@ -198,7 +201,7 @@ def diagnose(
     """
     from lab.pipeline import PipelineRequest
 
-    request = PipelineRequest("diagnose", recordings=_opened(recordings), fit=fit, models=cameras or {})
+    request = PipelineRequest("diagnose", recordings=_opened(recordings), fit=fit, models=cameras or {}, engine=engine)
     found = _run(request, progress).diagnosis
     assert found is not None
     return found
@@ -211,6 +214,7 @@ def evaluate(
     report: str | Path | None = None,
     fit: FitResult | None = None,
     cameras: Mapping[Side, CameraFile] | None = None,
+    engine: Engine = DEFAULT_ENGINE,
     progress: bool | None = None,
 ) -> PipelineResult:
     """Fit, validate, diagnose and write the report, or the part of these that leads to `goal`.
@@ -220,6 +224,7 @@ def evaluate(
     report : the page to write, HTML; needed for the goal `report`
     fit : the recordings' fit; None: it is made
     cameras : camera models by side, in place of the fitted ones
+    engine : as of `diagnose`
     progress : show a bar; None: on a terminal and in a notebook
 
     Returns `fit`, `validation`, `diagnosis`, `improved` (the cameras with the effects that were found, by side) and
@@ -236,8 +241,9 @@ def evaluate(
         raise InputError(f"evaluate: goal {goal} {'needs' if report is None else 'takes no'} report, the page to write")
     file = None if report is None else Path(report)
     request = PipelineRequest(
-        cast("Goal", goal), recordings=_opened(recordings), fit=fit, models=cameras or {}, report_file=file
-    )
+        cast("Goal", goal), recordings=_opened(recordings), fit=fit, models=cameras or {}, report_file=file,
+        engine=engine,
+    )  # fmt: skip
     return _run(request, progress)
 
 

@@ -25,6 +25,7 @@ from lab.capture.file_lock import Lock
 from lab.capture.records import JobState, now
 from lab.capture.store import Store
 from lab.capture.tables import JobRow
+from lab.engine import DEFAULT_ENGINE, Engine
 from lab.errors import Cancelled, CannotWrite, DeviceError, InputError, NoRoom, NotDetermined, failure_of_environment
 from lab.pipeline import (
     STEPS,
@@ -117,6 +118,7 @@ def run_job(
     capturer: Capturer | None = None,
     camera_model: str | None = None,
     station: Station | None = None,
+    engine: Engine = DEFAULT_ENGINE,
 ) -> None:
     """Carry out a job, in this process or on a worker; its result goes to the registry. Never raises."""
     store = Store(root, database_url)
@@ -132,7 +134,7 @@ def run_job(
             kind, source = cast(Goal, row.kind), row.source
         tell = _Reporter(store, job_id)
         try:
-            request = _request(store, kind, source, job_id, resolve, station)
+            request = replace(_request(store, kind, source, job_id, resolve, station), engine=engine)
             if camera_model is not None:
                 request = replace(request, models=_models(store, request, camera_model))
             run_pipeline(request, tell.pipeline, store=store, capturer=capturer)
@@ -303,14 +305,16 @@ class JobRunner:
         capturer: Capturer | None = None,
         camera_model: str | None = None,
         station: Station | None = None,
+        engine: Engine = DEFAULT_ENGINE,
     ) -> str:
         """Queue a job on a session's id or a recording set's folder; returns the job's id.
 
         `capturer`: how the job reaches the instruments; with one, the job runs in a thread of this process. `resolve`:
         of a pipeline, take the captures that tell the remaining rivals apart, within these limits. `station`: the one
         that made the recordings, for `resolve` on a set's folder (`lab.resolve.station_of`). `camera_model`: id of one
-        that stands in for the fitted cameras of a validation or a diagnosis. Raises InputError for an unknown kind,
-        and for `resolve` or `camera_model` where the job can't take it; NoRoom where the disk is full.
+        that stands in for the fitted cameras of a validation or a diagnosis. `engine`: which one diagnoses.
+        Raises InputError for an unknown kind, and for `resolve`, `camera_model` or `engine` where the job
+        can't take it; NoRoom where the disk is full.
         """
         if kind not in STEPS:
             raise InputError(f"job {kind!r}: no such work; choose from {', '.join(STEPS)}")
@@ -320,6 +324,8 @@ class JobRunner:
             raise InputError(
                 f"camera_model: a job of the kind {kind} takes none; leave it out, or validate or diagnose with it"
             )
+        if engine != DEFAULT_ENGINE and "diagnose" not in STEPS[kind]:
+            raise InputError(f"engine: a job of the kind {kind} makes no diagnosis; leave it out, or diagnose")
         self.store.room.check()
         client = self._dask() if capturer is None else None
         job_id = secrets.token_hex(8)
@@ -337,12 +343,17 @@ class JobRunner:
         work = (str(self.store.root), self.store.settings.database_url, job_id)
         if client is None:
             thread = threading.Thread(
-                target=run_job, args=(*work, resolve, capturer, None, station), name=f"job {job_id}", daemon=True
+                target=run_job,
+                args=(*work, resolve, capturer, None, station, engine),
+                name=f"job {job_id}",
+                daemon=True,
             )
             self._started[job_id] = thread
             thread.start()
         else:
-            future = client.submit(run_job, *work, camera_model=camera_model, key=f"job-{job_id}", pure=False)
+            future = client.submit(
+                run_job, *work, camera_model=camera_model, engine=engine, key=f"job-{job_id}", pure=False
+            )
             self._started[job_id] = future
             future.add_done_callback(lambda _: self._left(job_id))
         return job_id

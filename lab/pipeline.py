@@ -13,9 +13,11 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
+from lab.engine import DEFAULT_ENGINE, Engine
 from lab.errors import Cancelled, InputError
 from lab.shown import Displayable
 from sim.memory import return_freed_memory
@@ -72,6 +74,7 @@ class CaptureRequest:
     only : names of the sequences to take, where `plan` is None; empty: all
     parameters : values of the sequences' parameters in place of a full session's, where `plan` is None
     demands_certified : a new session runs only with cameras that have a certified calibration
+    standards : take what the standards ask for, where `plan` is None, in place of `only` and `parameters`
     """
 
     session: str = ""
@@ -82,6 +85,7 @@ class CaptureRequest:
     name: str = ""
     notes: str = ""
     demands_certified: bool = False
+    standards: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,6 +105,7 @@ class PipelineRequest:
     improved : the cameras with the effects that `diagnosis` names, by side, for the report; where none are given, those
     that are kept with it models : camera files that replace the fitted cameras, by side, in validation and diagnosis
     resolve : after the diagnosis, take the captures that tell the remaining rivals apart, within these limits; None: no
+    engine : which engine diagnoses
     station : the one that made `recordings` (`lab.resolve.station_of`), which takes these captures
     pictures : draw the residual pictures of the diagnosis
     bootstrap : healthy cameras that are drawn frame by frame for the threshold of the diagnosis
@@ -125,6 +130,7 @@ class PipelineRequest:
     pictures: bool = True
     bootstrap: int = 0
     workers: Workers | None = None
+    engine: Engine = DEFAULT_ENGINE
     report_file: Path | None = None
 
     def __post_init__(self) -> None:
@@ -240,7 +246,7 @@ def capture_here(
     Raises what `CaptureSession.run` raises, and `Cancelled` if `tell` does: the session can then be resumed.
     """
     from lab.calibration.life import check_certified
-    from lab.capture.plan import full_plan
+    from lab.capture.plan import full_plan, standards_plan
     from lab.capture.session import CaptureSession
     from lab.capture.station import drivers_of
 
@@ -262,10 +268,15 @@ def capture_here(
             store, request.session, station=station, on_progress=told, connect=drivers, check_certified=check_certified
         )
     else:
+        usual = (
+            standards_plan(station, request.quick)
+            if request.standards
+            else full_plan(station, request.quick, request.only or None, request.parameters)
+        )
         session = CaptureSession.start(
             store,
             station,
-            request.plan or full_plan(station, request.quick, request.only or None, request.parameters),
+            request.plan or usual,
             name=request.name,
             notes=request.notes,
             demands_certified=request.demands_certified,
@@ -395,7 +406,9 @@ class _Pipeline:
         if self.store.session(self._session).state != "finished":
             return None
         for found in self.store.results(self._session, kind):
-            if found.document.get("baseline") is None:  # of the fitted cameras, not of others that stood in for them
+            # of the fitted cameras, not of others that stood in for them, and by the engine that is asked for
+            is_by_another = self.request.engine != found.document.get("engine", "today")
+            if found.document.get("baseline") is None and not (kind == "diagnose" and is_by_another):
                 self._results[kind] = found.id
                 return model.model_validate(found.document)
         return None
@@ -483,6 +496,7 @@ class _Pipeline:
 
     def _diagnosed(self, recordings: RecordingSet, step: Step) -> Diagnosis:
         from lab.diagnose import examine
+        from lab.fit import FOR_DIAGNOSIS, fit_recording_set
 
         begun = 0.1 if step == "resolve" else 0.0
         found = examine(
@@ -494,6 +508,8 @@ class _Pipeline:
             bootstrap=self.request.bootstrap,
             workers=self.request.workers,
             station=self._station(),
+            engine=self.request.engine,
+            refit=partial(fit_recording_set, steps=FOR_DIAGNOSIS),
         )
         return replace(found, result=found.result.model_copy(update={"baseline": self._baseline}))
 

@@ -1,7 +1,7 @@
 """The mock bench: one shared light path, the targets in front of it, and two cameras that look at them.
 
     lamp -> filter wheel -> monochromator (zero order at 0 nm) -> shutter -> integrating sphere -> target -> cameras
-                                                                                screen ------------------^
+                                                             light source (LEDs) -----^      screen ----^
 
 Every mock instrument asks this object for light, and nothing else connects them: the monochromator's mock turns the
 wheel, the radiometer's mock reads `Bench.radiance()`, the cameras' mocks call `Bench.expose()`. All of it is
@@ -22,7 +22,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -191,6 +191,12 @@ class Bench:
         with self._lock:
             self._light = replace(self._light, slit_um=float(width_um))
 
+    def set_leds(self, shares: Mapping[int, float]) -> None:
+        """Light the LEDs at the sphere's second port: share 0..1 by nominal wavelength (nm); all others are dark."""
+        lit = tuple(sorted((int(nm), float(share)) for nm, share in shares.items() if share > 0.0))
+        with self._lock:
+            self._light = replace(self._light, leds=lit)
+
     def _drift(self, at_s: float) -> float:
         """Factor on the lamp at a virtual time: a slow swing of 0.04 %."""
         return 1.0 + 4e-4 * float(np.sin(2 * np.pi * (at_s - self._started_s) / 2400.0))
@@ -355,7 +361,7 @@ class Bench:
             placed, light, shown, stop = self._placed, self._light, self._shown, self._stop
             turn_deg, transfers = self._turn_deg, self._transfers[side]
         camera = self._camera(side, stop)
-        if not light.shutter_open and placed not in ("cap", "screen"):
+        if not light.shines and placed not in ("cap", "screen"):
             placed, light = "sphere", LightSettings()
         key: tuple[object, ...] = (
             side,

@@ -396,9 +396,10 @@ def _start_bench(
     # The bench brings the whole forward model along: only this command pays for it.
     from mocks.cornerstone260 import MockCornerstone260
     from mocks.display import Page, browse
+    from mocks.pe4000 import MockPe4000
     from mocks.specbos1211 import MockSpecbos1211
     from mocks.stage import MockStage
-    from mocks.targets import SCREEN_COLS, SCREEN_ROWS
+    from mocks.targets import SCREEN_COLS, SCREEN_ROWS, station_lights
     from mocks.usb import SERIAL_NUMBERS, serve_usbip, stereo_pair
 
     running.callback(stop.set)
@@ -406,12 +407,14 @@ def _start_bench(
     addresses: dict[str, dict[str, Any]] = {
         "monochromator": {"driver": "cornerstone260"},
         "spectroradiometer": {"driver": "specbos1211"},
+        "light_source": {"driver": "pe4000"},
         "display": display_table,
         "stage": {"driver": "operator"},
     }
     for instrument, grammar, endpoint in (
         ("monochromator", MockCornerstone260(place), Tcp(line.host, 0) if line.serial_over_tcp else Pty()),
         ("spectroradiometer", MockSpecbos1211(place), Tcp(line.host, 0) if line.serial_over_tcp else Pty()),
+        ("light_source", MockPe4000(place), Tcp(line.host, 0) if line.serial_over_tcp else Pty()),
         ("stage", MockStage(place), Tcp(line.host, 0)),
     ):
         address = _serve_in_thread(running, stop, instrument, grammar, endpoint, faults.get(instrument, ()))
@@ -426,6 +429,7 @@ def _start_bench(
         # The first frame of a new scene is rendered while the camera exposes: real seconds for virtual milliseconds.
         address = line.advertised(usb.url(serial_number))
         addresses[f"cameras.{side}"] = {"driver": "u3v", "address": address, "timeout_s": 60.0}
+    addresses["light_source"]["lights"] = station_lights()
     addresses["cameras.left"]["output_line"] = "Line1"  # wired to the right camera's Line0
     known: dict[str, Any] = {"cameras": place.station_cameras(), "targets": place.station_targets()}
     return addresses, known
@@ -547,7 +551,8 @@ def _wait_for_parent(stop: threading.Event) -> None:
 
 
 def _bench_faults(specs: list[str]) -> dict[str, tuple[Fault, ...]]:
-    instruments = ("monochromator", "spectroradiometer", "display", "stage", "cameras.left", "cameras.right")
+    families = ("monochromator", "spectroradiometer", "light_source", "display", "stage")
+    instruments = (*families, "cameras.left", "cameras.right")
     faults: dict[str, tuple[Fault, ...]] = {}
     for spec in specs:
         instrument, separator, what = spec.partition(":")

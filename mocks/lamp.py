@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 
@@ -65,6 +66,9 @@ class Lamp:
 
     def set_slit_um(self, width_um: float) -> None:
         """No slit."""
+
+    def set_leds(self, shares: Mapping[int, float]) -> None:
+        """No sphere that they could light."""
 
     def place(self, name: str) -> None:
         """Remember what was placed; raises `ValueError` for a name that isn't among the targets."""

@@ -1,6 +1,6 @@
 """The light before it meets a target: lamp, filter wheel, monochromator and integrating sphere; and the lit screen.
 
-lamp -> filter wheel -> monochromator (zero order at 0 nm) -> shutter -> integrating sphere"""
+lamp -> filter wheel -> monochromator (zero order at 0 nm) -> shutter -> integrating sphere <- LEDs at a second port"""
 
 from __future__ import annotations
 
@@ -22,6 +22,9 @@ from sim.uniform import radiance_at_lens
 WAVELENGTH_NM: FloatArray = np.arange(350.0, 1000.1, 0.5)
 #: Reciprocal linear dispersion of the monochromator: FWHM of the slit function in nm = slit width in mm x this.
 DISPERSION_NM_PER_MM = 3.16
+#: Full widths at half maximum (nm) of the light source's LEDs: those made white by a phosphor, and all others; and the
+#: radiance (W sr^-1 m^-2) of the sphere's port by one of them at its brightest.
+LED_FWHM_NM, USUAL_LED_FWHM_NM, LED_RADIANCE = {550: 100.0, 580: 80.0}, 22.0, 1.2
 #: Long-pass cut-on (nm) of each place of the filter wheel; None: an open place, infinity: a blank.
 FILTER_CUT_ON_NM: dict[int, float | None] = {1: None, 2: 375.0, 3: 550.0, 4: 780.0, 5: None, 6: np.inf}
 
@@ -34,11 +37,17 @@ class LightSettings:
     shutter_open: bool = False
     filter_place: int = 1
     slit_um: float = 3000.0
+    leds: tuple[tuple[int, float], ...] = ()  # nominal wavelength (nm) and share 0..1 of those that shine
 
     @property
     def first_order(self) -> bool:
         """Whether light of one wavelength leaves the monochromator, and not all of the lamp's."""
-        return self.wavelength_nm > 0
+        return self.wavelength_nm > 0 and not self.leds
+
+    @property
+    def shines(self) -> bool:
+        """Whether any light reaches the sphere."""
+        return self.shutter_open or bool(self.leds)
 
 
 def lamp_radiance(wavelength_nm: FloatArray, temperature_k: float = 3050.0) -> FloatArray:
@@ -55,6 +64,14 @@ def lamp_radiance(wavelength_nm: FloatArray, temperature_k: float = 3050.0) -> F
         return np.asarray(planck * emissivity * expit((w - 385.0) / 4.0) * expit((730.0 - w) / 4.0))
 
     return 0.03 * shape(np.asarray(wavelength_nm, float)) / shape(np.array([560.0]))
+
+
+def led_radiance(wavelength_nm: FloatArray, led_nm: int, share: float) -> FloatArray:
+    """Radiance (W sr^-1 m^-2 nm^-1) of the sphere's port by one LED at a share 0..1 of its most: a normal line at its
+    nominal wavelength, whose total is `LED_RADIANCE` whatever its width."""
+    std_nm = LED_FWHM_NM.get(led_nm, USUAL_LED_FWHM_NM) / np.sqrt(8.0 * np.log(2.0))
+    line = np.exp(-0.5 * np.square((np.asarray(wavelength_nm, float) - led_nm) / std_nm))
+    return np.asarray(share * LED_RADIANCE / (np.sqrt(2.0 * np.pi) * std_nm) * line)
 
 
 def screen_radiance(wavelength_nm: FloatArray) -> FloatArray:
@@ -98,9 +115,16 @@ def sphere_radiance(light: LightSettings, wavelength_nm: FloatArray) -> FloatArr
     """Radiance (W sr^-1 m^-2 nm^-1) of the sphere's port for a setting of the light path.
 
     Zero order passes all wavelengths. In first order at w the second order of w/2 leaves the slit at the same angle,
-    with half the width in wavelength: only the filter wheel keeps it out. Stray light: 1e-6 of zero order.
+    with half the width in wavelength: only the filter wheel keeps it out. Stray light: 1e-6 of zero order. LEDs add
+    theirs, whatever the shutter does.
     """
     w = np.asarray(wavelength_nm, float)
+    leds = np.sum([led_radiance(w, *led) for led in light.leds], axis=0) if light.leds else np.zeros_like(w)
+    return np.asarray(_by_monochromator(light, w) + leds)
+
+
+def _by_monochromator(light: LightSettings, w: FloatArray) -> FloatArray:
+    """Return the part of the sphere's radiance that comes through the monochromator's shutter."""
     if not light.shutter_open:
         return np.zeros_like(w)
     lamp = lamp_radiance(w) * filter_transmittance(light.filter_place, w)

@@ -31,6 +31,7 @@ class MockPe4000(Grammar):
 
     def __init__(self, light: MeasuredLight) -> None:
         super().__init__(light.clock)
+        self._light = light
         self._line = bytearray()
         self._arriving = 0
         self.state = {"A": ("X", "F", 50), "B": ("X", "F", 0), "C": ("X", "F", 100), "D": ("X", "F", 20)}
@@ -50,7 +51,12 @@ class MockPe4000(Grammar):
 
     def _end(self) -> list[bytes]:
         self.loaded[self._channel_of(self._arriving)] = self._arriving
+        self._shine()
         return []
+
+    def _shine(self) -> None:
+        """Let the light path have the light that is there now."""
+        self._light.set_leds({nm: self.shines(nm) for leds in LEDS.values() for nm in leds})
 
     def shines(self, nm: int) -> float:
         """Return the share 0..1 at which an LED gives light now."""
@@ -83,6 +89,7 @@ class MockPe4000(Grammar):
             if self._done_at is not None:
                 self._end()
             self._arriving, self._done_at = int(found[1]), self.clock.now() + _LOAD_S
+            self._shine()
             return [command]
         return []
 
@@ -91,6 +98,7 @@ class MockPe4000(Grammar):
             return []
         for letter, selected, on, percent in _GROUP.findall(groups):
             self.state[letter] = (selected, on if selected == "S" else "F", int(percent))
+        self._shine()
         return [self._css()]
 
     def _css(self) -> str:

@@ -79,6 +79,15 @@ TURNS_DEG, TEMPERATURES_C = (
     {"usual": None, "35 C": 35.0, "45 C": 45.0},
 )
 
+#: Lights of the light source, as a lab mixes them: shares of its LEDs' most by nominal wavelength (nm), those of a
+#: colour temperature (K) with the chromaticity of a black body to within 100 K.
+MIXES: dict[float, dict[int, float]] = {
+    3000.0: {460: 0.14, 550: 0.90, 635: 0.78},
+    4500.0: {460: 0.30, 550: 0.90, 635: 0.46},
+    6500.0: {460: 0.46, 550: 0.90, 635: 0.30},
+}
+SINGLE_LEDS_NM = (460, 525, 635)
+
 #: Names of all targets.
 TARGETS = (
     *("cap", "sphere", "colorchecker", *EDGE_ANGLES_DEG, "screen", *BOARD_POSES),
@@ -283,6 +292,19 @@ def station_targets(cameras: Mapping[Side, HiddenCamera]) -> dict[str, Any]:
     for name, sensor_c in TEMPERATURES_C.items():
         targets[name] = {"kind": "sensor_temperature"} | ({} if sensor_c is None else {"sensor_c": sensor_c})
     return targets
+
+
+def station_lights() -> dict[str, Any]:
+    """Lights of the light source by name, for the station file's `[light_source.lights]`: `channels`, and
+    `colour_temperature_k` or `wavelength_nm`."""
+    white = {
+        f"{kelvin:g} K": {
+            "colour_temperature_k": kelvin,
+            "channels": {str(nm): share for nm, share in mix.items()},
+        }
+        for kelvin, mix in MIXES.items()
+    }
+    return white | {f"{nm} nm": {"wavelength_nm": float(nm), "channels": {str(nm): 1.0}} for nm in SINGLE_LEDS_NM}
 
 
 def _chart_layout(camera: HiddenCamera) -> dict[str, Any]:

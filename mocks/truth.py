@@ -22,12 +22,14 @@ from sim.camera import CameraModel, Geometry, Lens, Shutter, Side
 from sim.effects.base import Effect
 from sim.effects.dark_current_temperature import DarkCurrentTemperature
 from sim.effects.infrared_cut_filter import InfraredCutFilter
+from sim.effects.lamp_ageing import LAMP_LIT, PIVOT_NM, LampAgeing
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.effects.shutter_leakage import ShutterLeakage
+from sim.effects.source_drift import SETTLES_NEVER_MIN, SourceDrift
 from sim.optics.filters import SODIUM_NM
 from sim.sensor.electrons import FixedPattern
 from sim.spectrum import FloatArray, Spectrum
-from sim.stages import ComplexArray, Image, image_of
+from sim.stages import ComplexArray, Image, Light, image_of
 
 ROWS, COLS, PITCH_UM = 480, 640, 3.0
 #: Distance of the cameras, and from them to where targets stand (mm). Both look at the same point there.
@@ -64,6 +66,49 @@ class RipplingInfraredCutFilter(InfraredCutFilter):
             return np.asarray(1.0 - 0.0015 * (1.0 + np.cos(2 * np.pi * wavelength_nm / 60.0)))
 
         return super().on_image(image).add_laws(transmittance=rippled)
+
+
+class TwoStageWarmUp(SourceDrift):
+    """A lamp that warms up in two stages, as lamps do: 6 % of the drift's first slope settles four times as fast as the
+    rest. Its end is 4.5 % short of the one time constant's that is stated."""
+
+    def on_light(self, light: Light) -> Light:
+        if self.drift_percent_per_min == 0.0 or self.settling_min == SETTLES_NEVER_MIN:
+            return super().on_light(light)
+
+        def level(elapsed_s: float) -> float:
+            settled = [
+                share * settling_min * -float(np.expm1(-elapsed_s / 60.0 / settling_min))
+                for share, settling_min in ((0.94, self.settling_min), (0.06, 0.25 * self.settling_min))
+            ]
+            return 1.0 + self.drift_percent_per_min / 100.0 * sum(settled)
+
+        return light.add_laws(level=level)
+
+
+class BendingLampAgeing(LampAgeing):
+    """A lamp that has aged as absorbers do, more steeply towards the blue: the logarithm of its change bends by 5 % for
+    each 100 nm."""
+
+    def on_light(self, light: Light) -> Light:
+        def bent(wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
+            if kind not in LAMP_LIT:
+                return radiance
+            off = (wavelength_nm - PIVOT_NM) / 100.0
+            aged = radiance * np.exp(0.01 * self.reddening_percent * (off - 0.05 * np.square(off)))
+            total = float(np.trapezoid(aged, wavelength_nm))
+            return radiance if total <= 0.0 else np.asarray(aged * (np.trapezoid(radiance, wavelength_nm) / total))
+
+        return light.add_laws(spectrum=bent) if self.reddening_percent else light
+
+
+#: How the bench renders effects of the lamp: finer than the laws that a diagnosis fits.
+FINER: dict[type[Effect], type[Effect]] = {SourceDrift: TwoStageWarmUp, LampAgeing: BendingLampAgeing}
+
+
+def _finer(effect: Effect) -> Effect:
+    kind = FINER.get(type(effect))
+    return effect if kind is None else kind(**dict(effect))
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +319,11 @@ def hidden_truth(seed: int = 1, concealed: Concealed | None = None, shape: tuple
     return Truth(
         {
             side: _camera(
-                side, np.random.default_rng([seed, index]), effects.get(side, ()), shape, concealed is not None
+                side,
+                np.random.default_rng([seed, index]),
+                tuple(map(_finer, effects.get(side, ()))),
+                shape,
+                concealed is not None,
             )
             for index, side in enumerate(SIDES)
         }

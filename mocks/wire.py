@@ -20,7 +20,7 @@ import time
 import tty
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -53,6 +53,7 @@ class MeasuredLight(Protocol):
     def set_shutter(self, opened: bool) -> None: ...
     def set_filter(self, place: int) -> None: ...
     def set_slit_um(self, width_um: float) -> None: ...
+    def set_leds(self, shares: Mapping[int, float]) -> None: ...
     def radiance(self) -> Spectrum: ...
 
 

@@ -119,8 +119,12 @@ def scene_light(
     before_lens, image_state = light_of(camera, effects), image_of(camera, effects)
     x_um: FloatArray = (col - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
     y_um: FloatArray = (row - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
-    shade = Uniform(camera, effects).shade_light(shade, x_um, y_um)
+    uniform = Uniform(camera, effects)
+    shade = uniform.shade_light(shade, x_um, y_um)
     images = {channel: _scatter_light(image, image_state, shade) for channel, image in images.items()}
+    if uniform.has_patterns and (light := _brightest_light(scene)) is not None:
+        # of scenes with several lights it is that of the brightest
+        images = {c: image * uniform.pattern(c, light, scene.kind, x_um, y_um) for c, image in images.items()}
     if not before_lens.ambient_e_per_s:
         return SceneLight(mosaic.assemble(images, camera.cfa))
     room = {channel: np.full(shape, before_lens.ambient(channel)) for channel in camera.channels}
@@ -255,12 +259,7 @@ def check_overlap(camera: CameraModel, scene: Scene) -> None:
     """Raises ValueError for a scene that sheds light, none of which any channel can see: most likely a unit was
     mistaken.
     """
-    lights = [value for item in vars(scene).values() for value in (item if isinstance(item, tuple) else (item,))]
-    spectra = [light for light in lights if isinstance(light, Spectrum)]
-    if isinstance(scene, SpectralImage):
-        brightest = np.max(scene.radiance.reshape(-1, scene.radiance.shape[2]), axis=0)
-        spectra = [Spectrum.of(scene.wavelength_nm, brightest)]
-    shining = [light for light in spectra if max(light.value) > 0]
+    shining = [light for light in _lights_of(scene) if max(light.value) > 0]
     seen = [_span_nm([efficiency(camera, channel)]) for channel in camera.channels]
     lit = _span_nm(shining)
     if shining and all(min(high, lit[1]) <= max(low, lit[0]) for low, high in seen):
@@ -269,6 +268,20 @@ def check_overlap(camera: CameraModel, scene: Scene) -> None:
             f"the scene's light lies at {lit[0]:g} to {lit[1]:g} nm, outside the limits {low:g} to {high:g} nm of the "
             "quantum efficiency: give wavelengths in nm, or a curve that reaches the light"
         )
+
+
+def _lights_of(scene: Scene) -> list[Spectrum]:
+    """Return the spectra of a scene's lights."""
+    if isinstance(scene, SpectralImage):
+        brightest = np.max(scene.radiance.reshape(-1, scene.radiance.shape[2]), axis=0)
+        return [Spectrum.of(scene.wavelength_nm, brightest)]
+    lights = [value for item in vars(scene).values() for value in (item if isinstance(item, tuple) else (item,))]
+    return [light for light in lights if isinstance(light, Spectrum)]
+
+
+def _brightest_light(scene: Scene) -> Spectrum | None:
+    """Return the light of the highest radiance at any wavelength; None of a scene without light."""
+    return max(_lights_of(scene), key=lambda light: max(light.value), default=None)
 
 
 def _span_nm(curves: Sequence[Spectrum]) -> tuple[float, float]:

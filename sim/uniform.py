@@ -171,6 +171,17 @@ class Uniform:
             light = light * np.maximum(law(x_um, y_um), 0.0)
         return light
 
+    @property
+    def has_patterns(self) -> bool:
+        """Return whether the sensitivity differs by place and wavelength."""
+        return bool(self._image.patterns)
+
+    def pattern(self, channel: str, radiance: Spectrum, kind: str, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+        """Factor on a channel's light of `radiance` at places that stand for the whole frame (um from the sensor's
+        centre), of mean 1."""
+        wavelength_nm, weight = detect_light(self.camera, channel, [(radiance, None)], self._effects, kind)
+        return self._image.pattern(wavelength_nm, weight[0], x_um, y_um)
+
     def source(self, elapsed_s: float) -> float:
         """Factor on the source's radiance at a time after the first capture."""
         return self._light.source(elapsed_s)

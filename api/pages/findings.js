@@ -1,7 +1,7 @@
 // What a session's diagnosis found: in words, with the measurements and the frames that prove it, before and after.
 
 import { chart, key, number } from "./charts.js";
-import { $, ask, brushOf, element } from "./page.js";
+import { $, ask, brushOf, cells, element, show } from "./page.js";
 
 const CELL = 6; // px of a cell of a residual picture
 let shown = ""; // the source and the diagnosis that stand there
@@ -55,6 +55,37 @@ function drawProof({ title, caption, curve }) {
   ];
   const drawn = chart({ title: `${title}: ${caption}`, series, x: { label: curve.axis.replaceAll("_", " ") }, y: { label: curve.quantity || "measured" } });
   return element("figure", {}, drawn, element("figcaption", {}, element("strong", { textContent: `${title}. ` }), caption, " ", ...key(series)));
+}
+
+/** @param {Model<"RivalOdds">[] | null | undefined} rivals */
+const oddsText = (rivals) => (rivals ?? []).map((one) => `${one.name.replaceAll("_", " ")} ${one.probability.toFixed(2)}`).join(", ");
+
+/** @param {Model<"Resolution">} one */
+function resolutionRow(one) {
+  const seconds = (/** @type {number | null | undefined} */ s) => (s == null ? "–" : String(Math.round(s)));
+  const after = one.rivals_after == null ? "being diagnosed" : oddsText(one.rivals_after) || "no name";
+  const made = element(
+    "tr",
+    {},
+    element("td", { textContent: `${oddsText(one.rivals)} (${one.side})` }),
+    element("td", {}, element("a", { href: `#/sessions/${one.session}`, textContent: one.capture })),
+    element("td", { className: "number", textContent: one.information_nat == null ? "–" : one.information_nat.toFixed(2) }),
+    element("td", { className: "number", textContent: seconds(one.expected_s) }),
+    element("td", { className: "number", textContent: seconds(one.spent_s) }),
+    element("td", { textContent: after }),
+  );
+  return cells(made, "", "Captured", "Information, nat", "Expected, s", "Took, s", "Afterwards");
+}
+
+/** The captures by which a session's rivals were told apart, each with what was in doubt before and after it.
+ * @param {Model<"ResolveJournal"> | null | undefined} journal */
+export function showResolving(journal) {
+  $("resolving").hidden = !journal;
+  if (!journal) return;
+  const budget = journal.budget_min == null ? "" : ` of ${journal.budget_min} min`;
+  const spent = journal.resolutions.reduce((sum, one) => sum + (one.spent_s ?? 0), 0);
+  $("resolving-end").textContent = `${journal.end ?? "goes on"}${journal.reason ? `: ${journal.reason}` : ""}. Lab time: ${(spent / 60).toFixed(1)} min${budget}.`;
+  show("resolving-rows", journal.resolutions.map((one, at) => ({ id: at, one })), ({ one }) => resolutionRow(one));
 }
 
 /** Shows what the newest diagnosis of a source found, if there is one.

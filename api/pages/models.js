@@ -31,7 +31,7 @@ function row(one) {
   const made = element(
     "tr",
     {},
-    element("td", { textContent: one.id }),
+    element("td", {}, one.sides.length ? element("a", { href: `#/models/${one.id}`, textContent: one.id }) : one.id),
     element("td", { textContent: one.kind }),
     element("td", {}, one.kind === "sent" ? "" : element("a", { href: `#/${of}`, textContent: one.session_id ?? one.recordings_id ?? "" })),
     element("td", { textContent: one.sides.join(", ") || "not kept" }),

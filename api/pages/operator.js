@@ -6,6 +6,7 @@ import "./inspector.js";
 import "./models.js";
 import "./recordings.js";
 import "./source.js";
+import "./twin.js";
 import { $, Problem, addView, address, ask, element, forgetHalt, goTo, halt, may, mayHalt, post, put, query, reach, said, scopeIs, show, showView, told } from "./page.js";
 import { asked as planned, showEstimate, showPlan, take } from "./plan.js";
 import { queueIs, showQueue } from "./queue.js";

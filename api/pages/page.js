@@ -262,7 +262,7 @@ export const query = () => new URLSearchParams(address().split("?")[1] ?? "");
 
 const PAGE = 50;
 
-/** @typedef {"sessions" | "jobs" | "recordings" | "calibrations" | "models"} ListId */
+/** @typedef {"sessions" | "jobs" | "recordings" | "calibrations" | "models" | "predictions"} ListId */
 
 /** A list in pages. Its table's body is `id`; `no-ID`, `more-ID` and `count-ID` stand where there is none, ask for the next page, and say how many.
  * @template {string} Path

@@ -2,7 +2,7 @@
 
 import { asksBanner } from "./asks.js";
 import { showFrames, leaveFrames } from "./frames.js";
-import { showFindings } from "./findings.js";
+import { showFindings, showResolving } from "./findings.js";
 import { figureRow, searchIn } from "./figures.js";
 import { showOwnJobs } from "./jobs.js";
 import { $, LIVE, addView, address, api, ask, change, element, goTo, may, named, post, remove, replace, show, showView, time, told } from "./page.js";
@@ -200,6 +200,7 @@ async function showSource(first, kind, id, tab) {
   if (at === "live") await showWatched();
   else if (at === "findings") {
     await showFindings(source, one.results.diagnose);
+    showResolving(session ? session.resolving : null);
     replace($("findings-report"), reportOf(one, jobs) ?? "No report yet: start one above.");
   }
   else if (at === "figures") await showFigures(source, one.results.fit);

@@ -150,7 +150,9 @@ function showBench(parts, bench, safety) {
   if (!bench) parts.shutter.textContent = !safety ? "unknown" : safety.shutter === "closed" ? `closed ${clock(safety.at)}` : { none: "none", unknown: "unknown" }[safety.shutter];
   parts.shutter.className = open || (!bench && safety?.shutter === "unknown") ? "open" : "";
   const nm = bench?.wavelength_nm;
-  parts.light.textContent = nm == null ? "–" : nm === 0 ? "white" : `${Number(nm.toFixed(1))} nm`;
+  const lit = Object.entries(bench?.lamp_levels ?? {}).map(([channel, share]) => `${channel} at ${Number((100 * share).toFixed(1))} %`);
+  const beam = nm == null ? "–" : nm === 0 ? "white" : `${Number(nm.toFixed(1))} nm`;
+  parts.light.textContent = lit.length ? `light source: ${lit.join(", ")}` : beam;
   const warm = Object.entries(bench?.temperature_c ?? {}).map(([side, value]) => `${side} ${value.toFixed(1)} °C`);
   parts.temperature.textContent = warm.join(", ") || "–";
 }

@@ -61,7 +61,7 @@ def _submit(service: Service, start: JobStart, source: str) -> str:
     if start.camera_model is not None and not camera_model(service, start.camera_model).sides:
         raise Conflict(f"camera model {start.camera_model}: no camera file was kept; fit again")
     limits = resolve_limits(start.resolve, start.resolve_minutes, start.resolve_rounds)
-    return service.jobs.submit(start.kind, source, resolve=limits, camera_model=start.camera_model)
+    return service.jobs.submit(start.kind, source, resolve=limits, camera_model=start.camera_model, engine=start.engine)
 
 
 @router.post(
@@ -94,7 +94,9 @@ def start_session_job(
         Demand(Permission.ADMIN)(request, None, None)
     limits = resolve_limits(start.resolve, start.resolve_minutes, start.resolve_rounds)
     station = service.station(start.station) if start.station is not None else service.store.station(session_id)
-    job_id = service.jobs.submit("pipeline", session_id, resolve=limits, capturer=service.live.capturer(station))
+    job_id = service.jobs.submit(
+        "pipeline", session_id, resolve=limits, capturer=service.live.capturer(station), engine=start.engine
+    )
     return accepted(service, job_id, response)
 
 
@@ -113,7 +115,9 @@ def start_pipeline(service: Here, start: PipelineStart, response: Response) -> J
     station = service.station(start.station)
     plan = start.plan(station)
     session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
-    job_id = service.jobs.submit("pipeline", session_id, resolve=limits, capturer=service.live.capturer(station))
+    job_id = service.jobs.submit(
+        "pipeline", session_id, resolve=limits, capturer=service.live.capturer(station), engine=start.engine
+    )
     return accepted(service, job_id, response)
 
 
@@ -147,7 +151,9 @@ def start_recordings_job(
     finally:
         let_go()
     capturer = service.live.capturer(own)
-    job_id = service.jobs.submit("pipeline", folder, resolve=limits, capturer=capturer, station=own)
+    job_id = service.jobs.submit(
+        "pipeline", folder, resolve=limits, capturer=capturer, station=own, engine=start.engine
+    )
     return accepted(service, job_id, response)
 
 

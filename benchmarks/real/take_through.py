@@ -1,21 +1,25 @@
 """One set through import, fit and diagnose, and what that takes.
 
-`python -m benchmarks.real.take_through FOLDER OUT` is the process of one set: FOLDER holds the recordings, OUT what is
-declared of them, and then `fit.json` and `diagnose.json`.
+`python -m benchmarks.real.take_through FOLDER OUT [--engine evidence]` is the process of one set: FOLDER holds the
+recordings, OUT what is declared of them, and then `fit.json` and `diagnose.json`.
 """
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import os
 import resource
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
+from typing import get_args
 
 from benchmarks.real.sets import TABLE, DeclaredSet
 from evaluation.truth import load, store
+from lab.engine import DEFAULT_ENGINE, Engine
 from lab.errors import InputError
 from lab.formats.results import DiagnosisResult, FitResult
 from sim.parameters import Frozen
@@ -37,16 +41,19 @@ class Cost(Frozen):
     failed: str = ""
 
 
-def take_through(one: DeclaredSet, folder: Path, scratch: Path) -> tuple[FitResult, DiagnosisResult | None]:
+def take_through(
+    one: DeclaredSet, folder: Path, scratch: Path, engine: Engine = DEFAULT_ENGINE
+) -> tuple[FitResult, DiagnosisResult | None]:
     """Import, fit and diagnose a set.
 
     folder   of the recordings
     scratch  an empty folder, for what the import writes
+    engine   which one diagnoses
 
     Returns the fit and the diagnosis; None for a table of means, which has no frames to diagnose. Raises InputError.
     """
     from lab.diagnose import diagnose
-    from lab.fit import fit_recording_set
+    from lab.fit import FOR_DIAGNOSIS, fit_recording_set
     from lab.fit.spectral.mean_table import fit_mean_table
     from lab.formats.importers import ImportOptions, read_foreign
     from lab.formats.importers.images import read_camera_file
@@ -75,19 +82,20 @@ def take_through(one: DeclaredSet, folder: Path, scratch: Path) -> tuple[FitResu
         path = write(read_foreign(one.importer, path, options), scratch / "set")
     recordings = read(path)
     fit = fit_recording_set(recordings)
-    return fit, diagnose(recordings, fit)
+    refit = partial(fit_recording_set, steps=FOR_DIAGNOSIS)
+    return fit, diagnose(recordings, fit, engine=engine, refit=refit)
 
 
-def run_set(one: DeclaredSet, folder: Path, out: Path) -> Cost:
+def run_set(one: DeclaredSet, folder: Path, out: Path, engine: Engine = DEFAULT_ENGINE) -> Cost:
     """Take a set through in a process of its own. Where `out` holds its results by this code and of these recordings,
     they stand."""
-    state = state_of(one, folder)
+    state = state_of(one, folder) + ("" if engine == DEFAULT_ENGINE else f" {engine}")
     if (out / COST).is_file() and (kept := load(Cost, out / COST)).state == state:
         return kept
     for file in (FIT, DIAGNOSIS, COST):
         (out / file).unlink(missing_ok=True)
     store(one, out / DECLARED)
-    command = [sys.executable, "-m", "benchmarks.real.take_through", str(folder), str(out)]
+    command = [sys.executable, "-m", "benchmarks.real.take_through", str(folder), str(out), f"--engine={engine}"]
     with (out / "log.txt").open("w+", encoding="utf-8") as log:
         process = subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log)
         _, status, usage = os.wait4(process.pid, 0)
@@ -121,11 +129,11 @@ def state_of(one: DeclaredSet, folder: Path) -> str:
     return found.hexdigest()[:16]
 
 
-def main(folder: Path, out: Path) -> None:
+def main(folder: Path, out: Path, engine: Engine = DEFAULT_ENGINE) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (LONGEST_S, LONGEST_S))
     with tempfile.TemporaryDirectory() as scratch:
         try:
-            fit, diagnosis = take_through(load(DeclaredSet, out / DECLARED), folder, Path(scratch))
+            fit, diagnosis = take_through(load(DeclaredSet, out / DECLARED), folder, Path(scratch), engine)
         except InputError as error:
             sys.exit(str(error))
     store(fit, out / FIT)
@@ -134,4 +142,9 @@ def main(folder: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--engine", choices=get_args(Engine), default=DEFAULT_ENGINE)
+    given = parser.parse_args()
+    main(given.folder, given.out, given.engine)

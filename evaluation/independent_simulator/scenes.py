@@ -144,15 +144,22 @@ def pattern(
     }
 
 
-def chart(camera: ConcealedCamera, light: Array, box: tuple[int, int, int, int]) -> dict[str, Array]:
+def chart(
+    camera: ConcealedCamera,
+    light: Array,
+    box: tuple[int, int, int, int],
+    own: Callable[[Array, Array], Array] | None = None,
+) -> dict[str, Array]:
     """Return a ColorChecker of published reflectances on a grey card; `box`: first and last row and column (row0, col0,
-    row1, col1)."""
+    row1, col1). `own`: maps wavelengths and published reflectances (patches, wavelengths) to the chart's own."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from colour import SDS_COLOURCHECKERS
     patches = [
         np.interp(WAVELENGTH_NM, p.wavelengths, p.values) for p in SDS_COLOURCHECKERS["BabelColor Average"].values()
     ]
+    if own is not None:
+        patches = list(own(WAVELENGTH_NM, np.array(patches)))
     row0, col0, row1, col1 = box
     gap = max(1, round(0.01 * camera.rows))
     images = {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Literal
@@ -41,6 +41,8 @@ class Plan:
     lamp        of flats, chart and edges; exposures are those of the first lamp at its level
     light       factor on that lamp, chart_light: on the chart's
     longer      factor on the exposures of darks
+    chart   maps wavelengths and published reflectances (patches, wavelengths) to the chart's own
+    reading maps a light's radiance to what the radiometer reads
     temperature_c   of the sensor, in all captures; None: 25, and those of `warm`
     gain_db     that is stated of the captures
     """
@@ -60,6 +62,8 @@ class Plan:
     longer: float = 1.0
     temperature_c: float | None = None
     gain_db: float | None = None
+    chart: Callable[[Array, Array], Array] | None = None
+    reading: Callable[[Array], Array] = np.copy
 
 
 WHOLE_SESSION = Plan()
@@ -171,6 +175,10 @@ class _Recorder:
                  "temperature_c": temperature_c, "time": when.isoformat(), **more}
             )  # fmt: skip
 
+    def read(self, light: Array) -> str:
+        """Return the file in which the radiometer's reading of a light is kept."""
+        return self.noted(self.plan.reading(light))
+
     def noted(self, spectrum: Array) -> str:
         """Return the file in which a spectrum is kept: a reading of the radiometer, or a stated curve."""
         path = f"spectra/{self.prefix}{len(self.spectra):03d}.csv"
@@ -185,7 +193,7 @@ class _Recorder:
 
     def flats(self, plan: Plan) -> None:
         light = self.lamp()
-        path, images = self.noted(light), self.camera.uniform(light)
+        path, images = self.read(light), self.camera.uniform(light)
         levels = (*FLAT_LEVELS, *FLAT_LEVELS[::-1]) if plan.shuttle else FLAT_LEVELS
         repeats = 2 if plan.shuttle else max(plan.repeats, 3)
         for level in levels:
@@ -200,7 +208,7 @@ class _Recorder:
         exposure_s = min(self.camera.exposure_for(light(w), 0.8) for w in range(400, 721, 20))
         for w in range(400, 721, 10):
             images = self.camera.uniform(light(w), "narrowband")
-            path = self.noted(light(w))
+            path = self.read(light(w))
             self.take("narrowband", images, exposure_s, wavelength_nm=w, bandwidth_nm=10, radiance=path)
 
     def chart(self, plan: Plan) -> None:
@@ -208,8 +216,8 @@ class _Recorder:
         box = round(0.14 * camera.rows), round(0.12 * camera.cols), round(0.86 * camera.rows), round(0.88 * camera.cols)
         row0, col0, row1, col1 = box
         corners = [[row0, col0], [row0, col1], [row1, col1], [row1, col0]]
-        images, exposure_s = chart(camera, light, box), camera.exposure_for(0.9 * light, 0.8)
-        path = self.noted(light)
+        images, exposure_s = chart(camera, light, box, plan.chart), camera.exposure_for(0.9 * light, 0.8)
+        path = self.read(light)
         self.take("chart", images, exposure_s, 2, chart="ColorChecker24", corners=corners, radiance=path)
 
     def edges(self, plan: Plan) -> None:
@@ -222,7 +230,7 @@ class _Recorder:
         if plan.exposures:
             lights += [4.0 * light]
         for light in lights:
-            path, exposure_s = self.noted(light), camera.exposure_for(light, 0.8)
+            path, exposure_s = self.read(light), camera.exposure_for(light, 0.8)
             for angle in EDGE_ANGLES_DEG:
                 self.take("slanted_edge", edge(camera, angle, light, DARK_SIDE), exposure_s, 2, region=region,
                 angle_deg=angle,
@@ -249,7 +257,7 @@ class _Recorder:
     def screen(self, plan: Plan) -> None:
         """White, black, a checkerboard and Bernoulli noise on a screen."""
         camera, light = self.camera, 0.1 * lamp()
-        path = self.noted(light)
+        path = self.read(light)
         checkerboard = np.kron(np.indices((10, 13)).sum(0) % 2, np.ones((8, 8), int)).astype(np.uint8)
         noise = np.zeros((80, 104), np.uint8)
         noise[4:-4, 4:-4] = np.random.default_rng([camera.seed, 4]).integers(0, 2, (72, 96))

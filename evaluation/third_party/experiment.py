@@ -65,6 +65,11 @@ SOURCES: dict[str, Source] = {
     "trefoil": Source("GalSim", by_galsim.trefoil, "trefoil"),
     "secondary_coma": Source("GalSim", by_galsim.secondary_coma, "secondary_coma"),
     "tetrafoil": Source("GalSim", by_galsim.tetrafoil, "tetrafoil"),
+    # new ones at the end: a set's seed holds the model's place
+    "healthy_dark_current": Source("Pyxel", by_pyxel.PyxelDark.draw, None),
+    "persistence_of_three_traps": Source("Pyxel", by_pyxel.PyxelPersistence.draw_several, "persistence"),
+    "column_gain": Source("Pyxel", by_pyxel.Columns.draw, "column_gain"),
+    "cosmic_rays": Source("Pyxel", by_pyxel.Protons.draw, "cosmic_rays"),
 }
 
 

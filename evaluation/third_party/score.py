@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import betaincinv
 
 from sim.effects.library import effect
 
@@ -66,8 +67,17 @@ class Diagnosed:
         return tuple(name for name in self.names if name not in self.right_names)
 
 
+def share_with_interval(right: int, of: int) -> str:
+    """Return "RIGHT of OF (LOW-HIGH %)": the 95 % interval of the rate (Clopper and Pearson 1934)."""
+    if not of:
+        return "-"
+    low = betaincinv(right, of - right + 1, 0.025) if right else 0.0
+    high = betaincinv(right + 1, of - right, 0.975) if right < of else 1.0
+    return f"{right} of {of} ({100.0 * low:.0f}-{100.0 * high:.0f} %)"
+
+
 def table(results: Iterable[Diagnosed]) -> str:
-    """Return the table as Markdown, a row a source."""
+    """Return the table as Markdown, a row a source; rates with their 95 % intervals."""
     kept = list(results)
     lines = [
         "| simulator | model | sets | check | named | second names | nothing | sizes right | CPU s, median |",
@@ -77,10 +87,10 @@ def table(results: Iterable[Diagnosed]) -> str:
         own = [one for one in kept if one.source == source]
         use = [one for one in own if one.is_checked]
         sizes = [size for one in use for size in one.sizes]
-        named = "-" if own[0].effect is None else str(sum(one.is_named for one in use))
+        named = "-" if own[0].effect is None else share_with_interval(sum(one.is_named for one in use), len(use))
         seconds = sorted(second for one in use for second in one.second_names)
         words = ", ".join(f"`{second}` {seconds.count(second)}" for second in dict.fromkeys(seconds)) or "-"
-        right = f"{sum(size.is_right for size in sizes)} of {len(sizes)}" if sizes else "-"
+        right = share_with_interval(sum(size.is_right for size in sizes), len(sizes))
         cpu_s = f"{np.median([one.cpu_s for one in use]):.0f}" if use else "-"
         lines.append(
             f"| {own[0].simulator} | {source} | {len(own)} | {len(use)} of {len(own)} | {named} | {words} | "

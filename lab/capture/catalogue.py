@@ -195,7 +195,8 @@ def step_times(store: Store, station: Station) -> StepTimes:
 def _instruments(station: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
     """Driver and address of every instrument of a station's document."""
     entries = {
-        name: station.get(name) for name in ("monochromator", "spectroradiometer", "photodiode", "display", "stage")
+        name: station.get(name)
+        for name in ("monochromator", "spectroradiometer", "photodiode", "light_source", "display", "stage")
     }
     entries |= {f"cameras.{side}": camera for side, camera in station["cameras"].items()}
     return {name: (entry["driver"], entry["address"]) for name, entry in entries.items() if entry}

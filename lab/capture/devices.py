@@ -22,6 +22,7 @@ from drivers.camera.base import Frame, StreamingCamera, capture_together
 from drivers.camera.stream import MOST_LOST, FrameStream
 from drivers.display.base import Display
 from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.light_source.base import LightSource
 from drivers.monochromator.base import Monochromator
 from drivers.photodiode.base import IrradianceMeasurement, Photodiode
 from drivers.spectroradiometer.base import Spectroradiometer
@@ -219,6 +220,100 @@ def shut(monochromator: Monochromator) -> None:
             break
     if opened:
         raise InstrumentError("monochromator: its shutter is open though it was told to close; block the light by hand")
+
+
+class LampDevice(Device):
+    """The light source. Movable to shares 0..1 by channel, what isn't named dark; dark while a run is paused.
+
+    `levels`: the shares that it said of itself when it was lit, by channel."""
+
+    def __init__(self, light_source: LightSource) -> None:
+        super().__init__("light_source")
+        self.light_source = light_source
+        self.value: dict[str, float] | None = None
+        self.levels: dict[str, float] = {}
+        self._moving = threading.Lock()
+        self._barred = False
+
+    def check(self, shares: Mapping[str, float]) -> None:
+        """Raise InstrumentError for a channel that it hasn't got; nothing changes."""
+        channels = self.light_source.channels()
+        if unknown := shares.keys() - set(channels):
+            raise InstrumentError(
+                f"light source: no channel {min(unknown)!r}; it has {', '.join(channels)}: correct channels under "
+                "[light_source.lights] of the station file"
+            )
+
+    def set(self, shares: Mapping[str, float]) -> Status:
+        wanted = dict(shares)
+
+        def light() -> None:
+            with self._moving:
+                if self.value == wanted:
+                    self._check_still_lit()
+                    return
+                before, self.value = self.value, None
+                self.check(wanted)
+                # First what goes dark: channels may share a place, in which one of them can be lit at a time.
+                if before is None:
+                    self.light_source.stop()
+                for channel in before or {}:
+                    if channel not in wanted:
+                        self._set_level(0.0, channel)
+                for channel, share in wanted.items():
+                    self._set_level(share, channel)
+                self.levels = {channel: self.light_source.level(channel) for channel in wanted}
+                self._check_lit(wanted)
+                self.value = wanted
+
+        return Status("light source", light, MOVE_S)
+
+    def _set_level(self, share: float, channel: str) -> None:
+        if self._barred and share > 0.0:
+            raise InstrumentError("light source: the run was halted; it stays dark")
+        self.light_source.set_level(share, channel)
+
+    def _check_lit(self, wanted: Mapping[str, float]) -> None:
+        """Raise InstrumentError where a channel that was lit says that it is dark."""
+        for channel, share in wanted.items():
+            if share > 0.0 and self.levels[channel] == 0.0:
+                raise InstrumentError(
+                    f"light source: channel {channel} was set to {share:g} and says that it is dark: the level is less "
+                    "than half of its smallest step, or somebody switched it off; ask for a higher level, or switch it "
+                    "on"
+                )
+
+    def bar(self) -> None:
+        """Darken it now, whatever it does, and light it no more. Raises InstrumentError where it doesn't get dark."""
+        self._barred = True
+        self.light_source.stop()
+        with self._moving:  # what was about to light a channel has done so, or was refused
+            self.light_source.stop()
+            self.value = {}
+
+    def _check_still_lit(self) -> None:
+        """Raise InstrumentError where a channel isn't as it was set: somebody's hand may have switched it off."""
+        for channel, share in self.levels.items():
+            if (found := self.light_source.level(channel)) != share:
+                self.value = None
+                raise InstrumentError(
+                    f"light source: channel {channel} was set to {share:g} and is at {found:g} now; look who switches "
+                    "it, and resume"
+                )
+
+    async def stop(self, success: bool = True) -> None:
+        self.value = None
+        await bounded("light source", self.light_source.stop)
+
+    async def pause(self) -> None:
+        await self.stop()
+
+    def resume(self) -> None:
+        """Do nothing: after a pause, each step sets the light source."""
+
+    def readings(self) -> dict[str, float | str]:
+        lit = self.levels if self.value else {}
+        return {"lamp_levels": ", ".join(f"{channel}={share:g}" for channel, share in lit.items())}
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from datetime import datetime
 from functools import partial
@@ -25,6 +25,7 @@ from lab.capture.devices import (
     CamerasDevice,
     Device,
     HandDevice,
+    LampDevice,
     LightDevice,
     PhotodiodeDevice,
     RadiometerDevice,
@@ -50,10 +51,12 @@ HEAD_START_S = 0.5
 
 
 class BenchState(Frozen):
-    """State of the bench in a run. `wavelength_nm` 0: white light. None: there is no such instrument, or it moves."""
+    """State of the bench in a run. `wavelength_nm` 0: white light. `lamp_levels`: the light source's, a share 0..1 of
+    its most for each channel that is lit. None: there is no such instrument, or it moves."""
 
     shutter_open: bool | None = None
     wavelength_nm: float | None = None
+    lamp_levels: dict[str, float] | None = None
     temperature_c: dict[Side, float] = {}
 
 
@@ -93,6 +96,7 @@ class Instruments:
         self.screen = ScreenDevice(drivers.display, cells) if drivers.display else None
         radiometer = drivers.spectroradiometer
         self.radiometer = RadiometerDevice(radiometer, write_spectrum) if radiometer else None
+        self.lamp = LampDevice(drivers.light_source) if drivers.light_source else None
         self.photodiode = PhotodiodeDevice(drivers.photodiode) if drivers.photodiode else None
 
     @property
@@ -117,7 +121,8 @@ class Instruments:
     @property
     def devices(self) -> tuple[Device, ...]:
         """All devices that the station has, the cameras last."""
-        every = (self.target, self.light, self.shutter, self.screen, self.radiometer, self.photodiode, self.cameras)
+        light = (self.light, self.shutter, self.lamp, self.screen)
+        every = (self.target, *light, self.radiometer, self.photodiode, self.cameras)
         return tuple(device for device in every if device is not None)
 
     def state(self) -> BenchState:
@@ -126,6 +131,7 @@ class Instruments:
         return BenchState(
             shutter_open=self.shutter.value if self.shutter is not None else None,
             wavelength_nm=self.light.value.wavelength_nm if self.light is not None and self.light.value else None,
+            lamp_levels=dict(self.lamp.levels) if self.lamp is not None and self.lamp.value is not None else None,
             temperature_c={side: value for side, value in taken.items() if value is not None},
         )
 
@@ -155,8 +161,8 @@ class Instruments:
         """Raise DeviceError for what these steps need and an instrument can't do; nothing moves, and nothing is
         exposed.
 
-        That is a wavelength, a slit width, an exposure, a gain, the line that triggers a camera, and a screen of
-        another size."""
+        That is a wavelength, a slit width, a channel of the light source, an exposure, a gain, the line that triggers a
+        camera, and a screen of another size."""
         for asks, whence in self._demands(steps):
             try:
                 asks()
@@ -168,7 +174,15 @@ class Instruments:
     def _demands(self, steps: Sequence[Step]) -> Iterator[tuple[Callable[[], None], str]]:
         """Yield what is asked of the instruments without moving them, and, in words, where the plan's value comes
         from."""
-        limits = self.limits
+        yield from self._light_demands(steps)
+        exposures = self._exposures(steps)
+        for number, camera in enumerate(self.drivers.cameras.values()):
+            yield partial(camera.check_trigger, "line" if number else "software"), ""
+            for whence, exposure_s, gain_db in exposures:
+                yield partial(camera.check, exposure_s, gain_db), whence
+
+    def _light_demands(self, steps: Sequence[Step]) -> Iterator[tuple[Callable[[], None], str]]:
+        """Yield the part of `_demands` that bears on the light."""
         lights = {(nm, step.sequence) for step in steps if (nm := step.setting.wavelength_nm) is not None}
         for wavelength_nm, sequence in sorted(lights):
             whence = f"the sequence {sequence} needs it: give it other wavelengths, or leave it out"
@@ -185,19 +199,27 @@ class Instruments:
                     partial(self.light.monochromator.check_slit_um, slit_um),
                     "it stands as slit_um under [limits] of the station file",
                 )
-        exposures: dict[tuple[str, float], None] = {}
+        lamps = {tuple(step.setting.lamp.items()): step.sequence for step in steps if step.setting.lamp}
+        for channels, sequence in lamps.items():
+            if self.lamp is not None:
+                whence = f"the sequence {sequence} needs it: give it another light, or leave it out"
+                yield partial(self.lamp.check, dict(channels)), whence
+
+    def _exposures(self, steps: Sequence[Step]) -> Iterable[tuple[str, float, float]]:
+        """Return every exposure (s) and gain (dB) of a plan, and in words where they come from."""
+        limits = self.limits
+        found: dict[tuple[str, float, float], None] = {}
         for step in steps:
+            own_db = step.setting.gain_db
+            gain_db = limits.gain_db if own_db is None else own_db
+            gain = "gain_db under [limits] of the station file" if own_db is None else f"a gain of {own_db:g} dB"
             if isinstance(step.exposure, FixedExposure):
-                whence = f"the sequence {step.sequence} needs it, with gain_db under [limits] of the station file"
-                exposures[whence, step.exposure.exposure_s] = None
+                found[f"the sequence {step.sequence} needs it, with {gain}", step.exposure.exposure_s, gain_db] = None
             elif step.exposure is not None:
                 for key, exposure_s in (("min", limits.exposure_min_s), ("max", limits.exposure_max_s)):
-                    whence = f"exposure_{key}_s and gain_db under [limits] of the station file allow it: correct them"
-                    exposures[whence, exposure_s] = None
-        for number, camera in enumerate(self.drivers.cameras.values()):
-            yield partial(camera.check_trigger, "line" if number else "software"), ""
-            for whence, exposure_s in exposures:
-                yield partial(camera.check, exposure_s, limits.gain_db), whence
+                    whence = f"exposure_{key}_s and {gain} allow it: correct them"
+                    found[whence, exposure_s, gain_db] = None
+        return found
 
     def _check_screen(self, target: str) -> None:
         """Raise DeviceError where the display's screen isn't as large as the station file has it: something scales its

@@ -7,9 +7,11 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
 from lab.capture_kinds.base import SEQUENCES, Adjustment, Cells, Equipment, Sequence, Step, name_of
+from lab.capture_kinds.flare import FlareSequence
 from lab.errors import InputError
 from sim.parameters import read_quantities
 
@@ -88,6 +90,34 @@ def full_plan(
             f"parameters: {', '.join(sorted(idle))} isn't taken; name some of {', '.join(one.name for one in taken)}"
         )
     return CapturePlan(tuple(_with(sequence, wanted.get(sequence.name, {})) for sequence in taken))
+
+
+#: Sequences that the standards read; those that a station can't take are left out.
+STANDARDS_SEQUENCES = ("dark", "flat", "narrowband", "chart", "edge", "stereo")
+#: Levels of light that EMVA 1288 asks for at least, and images of a spatial stack.
+EMVA_LEVELS, STACK_IMAGES = 50, 16
+QUICK_LEVELS = 12
+
+
+def standards_plan(station: Equipment, quick: bool = False) -> CapturePlan:
+    """The captures that the standards ask for: EMVA 1288's levels up to saturation and spatial stacks, charts, edges,
+    boards, and the flare chart on the screen. `quick`: fewer levels, of which the standards' pages tell."""
+    names = [kind.name for kind in SEQUENCES.values() if kind.name in STANDARDS_SEQUENCES and kind.possible(station)]
+    taken = list(full_plan(station, quick, names).sequences)
+    count = QUICK_LEVELS if quick else EMVA_LEVELS
+    frames = 4 if quick else 2
+    # far enough beyond saturation that the least sensitive channel gets there, too
+    beyond = (1.15, 1.5, 2.2, 3.2, 4.5)
+    below = (round(float(level), 4) for level in np.linspace(0.02, 0.98, count - len(beyond)))
+    levels = (*below, *beyond, *(0.5,) * (STACK_IMAGES // frames))
+    own: dict[str, dict[str, Any]] = {
+        "flat": {"levels": levels, "frames": frames},
+        "dark": {"frames": STACK_IMAGES},
+    }
+    found = [_with(sequence, own.get(sequence.name, {})) for sequence in taken]
+    return CapturePlan(
+        (*found, *((FlareSequence(frames=2 if quick else 4),) if FlareSequence.possible(station) else ()))
+    )
 
 
 def _with(sequence: Sequence, values: Mapping[str, Any]) -> Sequence:

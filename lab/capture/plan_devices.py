@@ -25,6 +25,7 @@ from lab.capture.blocking_calls import Status
 from lab.capture.by_hand import ByHand
 from lab.capture.devices import (
     CamerasDevice,
+    LampDevice,
     LightDevice,
     PhotodiodeDevice,
     RadiometerDevice,
@@ -88,6 +89,7 @@ class PlanDevices:
     screen: ScreenDevice | None = None
     radiometer: PlanRadiometer | None = None
     photodiode: PhotodiodeDevice | None = None
+    lamp: LampDevice | None = None
 
 
 @contextlib.contextmanager
@@ -132,6 +134,7 @@ def plan_devices(
             screen=found.screen,
             radiometer=PlanRadiometer(radiometer, write_spectrum) if radiometer else None,
             photodiode=found.photodiode,
+            lamp=found.lamp,
         )
     finally:
         safe = found.make_safe()

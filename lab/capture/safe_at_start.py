@@ -32,9 +32,9 @@ REGISTRY_S = 1.0
 #: How long (s) the start waits for the shutters to be asked, and for all instruments to answer.
 SHUTTERS_S, INSTRUMENTS_S = 3.0, 3.0
 #: Keys of an instrument's table in a station file that its driver isn't given.
-_NOT_ITS_DRIVERS = ("driver", "address", "datasheet", "quantum_efficiency")
+_NOT_ITS_DRIVERS = ("driver", "address", "datasheet", "quantum_efficiency", "lights")
 #: The families after the monochromator's, those first whose drivers load fast; with the cameras in their place.
-_OTHERS = ("display", "stage", "cameras", "photodiode", "spectroradiometer")
+_OTHERS = ("light_source", "display", "stage", "cameras", "photodiode", "spectroradiometer")
 
 
 class _Station:

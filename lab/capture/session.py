@@ -264,6 +264,8 @@ class CaptureSession:
         with self._held:
             if self._instruments is None:
                 return None
+            if self._instruments.lamp is not None:
+                in_thread(self._instruments.lamp.bar)  # who stops all instruments hears whether it got dark
             if self._instruments.shutter is None:
                 return "none"
             self._instruments.shutter.bar()

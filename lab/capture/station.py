@@ -6,7 +6,7 @@ beforehand: addresses, data sheets, nominal layouts. Nothing in it is measured. 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast, get_args
@@ -17,12 +17,14 @@ from drivers.camera.base import Camera as CameraDriver
 from drivers.display.base import Display
 from drivers.errors import InstrumentError
 from drivers.instrument import Instrument
+from drivers.light_source.base import LightSource
 from drivers.monochromator.base import Monochromator
 from drivers.photodiode.base import Photodiode
 from drivers.registry import driver
 from drivers.spectroradiometer.base import Spectroradiometer
 from drivers.stage.base import Stage
 from lab.capture_kinds.base import AnyTarget, CaptureLimits, Target, TargetT
+from lab.capture_kinds.lamp import LampLight
 from lab.errors import DeviceError, InputError
 from lab.formats.recording_set import DataSheet
 from lab.formats.spectrum_csv import parse_spectrum
@@ -33,7 +35,7 @@ from sim.spectrum import Spectrum
 
 T = TypeVar("T")
 
-_FAMILIES = ("monochromator", "spectroradiometer", "photodiode", "display", "stage")
+_FAMILIES = ("monochromator", "spectroradiometer", "photodiode", "light_source", "display", "stage")
 
 
 class Address(BaseModel):
@@ -82,6 +84,13 @@ class StationCamera(Address):
         return self
 
 
+class StationLightSource(Address):
+    """The light source: its address, and its lights by name. The first of them is the one that is used where nobody
+    asks for another."""
+
+    lights: dict[str, LampLight] = Field(min_length=1)
+
+
 class Station(Frozen):
     """The content of a station file. `cameras` has a left one at least. None: the station has no such instrument.
 
@@ -93,6 +102,7 @@ class Station(Frozen):
     monochromator: Address | None = None
     spectroradiometer: Address | None = None
     photodiode: Address | None = None
+    light_source: StationLightSource | None = None
     display: Address | None = None
     stage: Address | None = None
     cameras: dict[Side, StationCamera] = Field(min_length=1)
@@ -135,6 +145,11 @@ class Station(Frozen):
     def sides(self) -> tuple[Side, ...]:
         """The sides that have a camera, left first."""
         return tuple(sorted(self.cameras))
+
+    @property
+    def lights(self) -> Mapping[str, LampLight]:
+        """The lights of the light source by name; none where the station has no light source."""
+        return {} if self.light_source is None else self.light_source.lights
 
     @property
     def f_number(self) -> float:
@@ -223,6 +238,7 @@ class Drivers:
     spectroradiometer: Spectroradiometer | None = None
     display: Display | None = None
     photodiode: Photodiode | None = None
+    light_source: LightSource | None = None
 
     @property
     def all(self) -> dict[str, Instrument]:
@@ -233,6 +249,7 @@ class Drivers:
             "display": self.display,
             "spectroradiometer": self.spectroradiometer,
             "photodiode": self.photodiode,
+            "light_source": self.light_source,
         }
         named |= {f"camera {side}": camera for side, camera in self.cameras.items()}
         return {name: found for name, found in named.items() if found is not None}
@@ -269,4 +286,5 @@ def drivers_of(station: Station) -> Drivers:
         spectroradiometer=made("spectroradiometer", station.spectroradiometer),
         display=made("display", station.display),
         photodiode=made("photodiode", station.photodiode),
+        light_source=made("light_source", station.light_source),
     )

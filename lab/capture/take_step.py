@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from bluesky.utils import Msg
 
-from lab.capture.devices import LightSetting, PhotodiodeDevice, Shot, ShownPattern
+from lab.capture.devices import LampDevice, LightSetting, PhotodiodeDevice, Shot, ShownPattern
 from lab.capture.instruments import Instruments
 from lab.capture.records import StoredFile
 from lab.capture_kinds.base import Capture, FindExposure, FixedExposure, Reading, RelativeExposure, Step
@@ -60,17 +60,29 @@ def arrange(step: Step, instruments: Instruments) -> Plan[None]:
             moves.append((instruments.shutter, False))
         else:
             moves.append((light, LightSetting(setting.wavelength_nm, setting.slit_um)))
+    lamp = _lamp_of(step, instruments)
+    if lamp is not None and not (setting.lamp and lamp.value == setting.lamp):
+        moves.append((lamp, setting.lamp))
     if instruments.screen is not None:
         moves.append((instruments.screen, ShownPattern(setting.pattern, setting.cell_px if setting.pattern else 1)))
     moves = [(device, value) for device, value in moves if device.value != value]
     for device, value in moves:
         yield Msg("set", device, value, group="arrange")
+    if lamp is not None and setting.lamp and lamp.value == setting.lamp:
+        yield Msg("set", lamp, setting.lamp, group="arrange")  # it reads back that nobody has switched it off
     yield Msg("wait", None, group="arrange")
     # Last: before the grating has arrived, the light has another wavelength.
     opens = instruments.shutter is not None and setting.wavelength_nm is not None and not instruments.shutter.value
     if opens:
         yield from _set_shutter(instruments, True)
     cameras.in_series = cameras.in_series and not moves and not opens
+
+
+def _lamp_of(step: Step, instruments: Instruments) -> LampDevice | None:
+    """Return the light source. Raises InputError where a step needs one and there is none."""
+    if step.setting.lamp and instruments.lamp is None:
+        raise InputError(f"station: step {step.id!r} needs a [light_source]; add it to the station file")
+    return instruments.lamp
 
 
 def adjust(name: str, instruments: Instruments) -> Plan[None]:
@@ -95,10 +107,10 @@ def _shoot(instruments: Instruments, shot: Shot) -> Plan[None]:
 
 
 def find_exposure(
-    wanted: FindExposure, instruments: Instruments, start_s: Mapping[Side, float]
+    wanted: FindExposure, instruments: Instruments, start_s: Mapping[Side, float], gain_db: float
 ) -> Plan[tuple[dict[Side, float], dict[Side, float]]]:
     """Search each camera's exposure (s) for the wanted level, with at most `TRIES` test frames that aren't kept.
-    Returns exposures and levels.
+    Returns exposures and levels. `gain_db`: of the cameras.
 
     After a saturated or unlit frame, the exposure is divided by 5 or multiplied by 10; after any other, it is
     multiplied by wanted level / level. Exposures stay within the station's limits. The last exposures are returned also
@@ -112,7 +124,7 @@ def find_exposure(
     levels: dict[Side, float] = {}
     before: tuple[dict[Side, float], dict[Side, float]] | None = None
     for _ in range(TRIES):
-        yield from _shoot(instruments, Shot(exposure_s, limits.gain_db, {}))
+        yield from _shoot(instruments, Shot(exposure_s, gain_db, {}))
         levels = dict(instruments.cameras.levels)
         following = dict(exposure_s)
         for side, level in levels.items():
@@ -173,7 +185,6 @@ def take(
     If the spectroradiometer refuses to measure the light (too dark, too bright), a step with captures is skipped, with
     the reason in its result; in a step without captures this raises DeviceError, as later steps need the spectrum.
     Raises InputError for a missing instrument."""
-    wavelength_nm = step.setting.wavelength_nm or 0.0
     photodiode = _irradiance_meter(step, instruments)
     if photodiode is not None and photodiode.dark_a is None:
         yield from _dark_current(instruments)
@@ -195,15 +206,17 @@ def take(
         files.append(radiometer.stored)
         result["radiance"] = step.radiance
     if photodiode is not None:
-        yield from _measure_irradiance(photodiode, wavelength_nm)
+        yield from _measure_irradiance(photodiode, irradiance_nm(step))
     captures: tuple[Capture, ...] = ()
+    gain_db = instruments.limits.gain_db if step.setting.gain_db is None else step.setting.gain_db
     if isinstance(step.exposure, FindExposure):
-        exposure_s, levels = yield from find_exposure(step.exposure, instruments, _start(instruments, results))
+        start_s = _start(instruments, results)
+        exposure_s, levels = yield from find_exposure(step.exposure, instruments, start_s, gain_db)
         result |= {"exposure_s": exposure_s, "level": levels}
     elif step.exposure is not None:
         shot = Shot(
             _exposures(step, instruments, results),
-            instruments.limits.gain_db,
+            gain_db,
             {capture.side: capture.frame for capture in step.captures},
             repeats,
         )
@@ -243,8 +256,11 @@ def _measure_irradiance(photodiode: PhotodiodeDevice, wavelength_nm: float | Non
 
 
 def _dark_current(instruments: Instruments) -> Plan[None]:
-    """Close the shutter and measure the photodiode's dark current."""
+    """Close the shutter, darken the light source, and measure the photodiode's dark current."""
     assert instruments.photodiode is not None
+    if instruments.lamp is not None and instruments.lamp.value != {}:
+        yield Msg("set", instruments.lamp, {}, group="lamp")
+        yield Msg("wait", None, group="lamp")
     if instruments.shutter is not None and instruments.shutter.value is not False:
         yield from _set_shutter(instruments, False)
     yield from _measure_irradiance(instruments.photodiode, None)
@@ -287,6 +303,7 @@ def _completed(step: Step, instruments: Instruments, dummies: int) -> tuple[Capt
             "temperature_c": frame.temperature_c,
             "time": frame.time,
             "dummy_frames": dummies or None,
+            "lamp_levels": dict(instruments.lamp.levels) if instruments.lamp and step.setting.lamp else None,
         }
         for key, field in type(capture).model_fields.items():
             for mark in field.metadata:

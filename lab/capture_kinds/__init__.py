@@ -22,6 +22,7 @@ FILES = (
     "checkerboard",
     "bernoulli",
     "charuco",
+    "flare",
 )
 for _file in FILES:
     register(import_module(f"{__name__}.{_file}").KIND)

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
 
+from lab.capture_kinds.lamp import LampLight
 from lab.errors import InputError
 from sim.camera import Side
 from sim.parameters import Frozen, Quantity
@@ -158,6 +159,12 @@ class Capture(Open):
     temperature_c: float | None = None
     time: datetime | None = None
     dummy_frames: int | None = Field(default=None, ge=0)  # of the same light and exposure, directly before; not kept
+    lamp_levels: dict[str, Annotated[float, Field(ge=0, le=1)]] | None = None  # shares by channel of the light source
+    colour_temperature_k: float | None = Field(default=None, gt=0)  # of the light source's light, as the lab states it
+
+    def __hash__(self) -> int:
+        """Of its id and its frame: equal captures have equal ones, and a capture may hold mappings."""
+        return hash((self.id, self.side, self.frame))
 
     @classmethod
     def unsupported(cls, document: dict[str, Any]) -> str | None:
@@ -289,6 +296,8 @@ class Equipment(Protocol):
     def list_targets(self, kind: type[TargetT]) -> dict[str, TargetT]: ...
     def one(self, kind: type[Target]) -> str: ...
     def lacks(self, *families: str) -> tuple[str, ...]: ...
+    @property
+    def lights(self) -> Mapping[str, LampLight]: ...
 
 
 class Setting(Frozen):
@@ -296,7 +305,8 @@ class Setting(Frozen):
 
     `wavelength_nm`: of the monochromator; 0 is zero order (white light), None keeps its shutter closed. `pattern`: path
     in the session of what the screen shows; None leaves the screen dark. `cell_px`: screen pixels per cell of the
-    pattern."""
+    pattern. `gain_db`: of the cameras; None: the station's. `lamp`: share 0..1 by channel of the light source; what
+    isn't named is dark."""
 
     target: str | None
     wavelength_nm: float | None = None
@@ -304,6 +314,8 @@ class Setting(Frozen):
     pattern: str | None = None
     cell_px: int = 1
     by_hand: tuple[str, ...] = ()
+    gain_db: float | None = None
+    lamp: dict[str, float] = {}
 
     @model_validator(mode="before")
     @classmethod
@@ -410,9 +422,10 @@ class Sequence(Frozen):
         return {}
 
     @classmethod
-    def check_instruments(cls, station: Equipment) -> None:
-        """Raise InputError if the station lacks an instrument of the sequence."""
-        if missing := station.lacks(*cls.instruments):
+    def check_instruments(cls, station: Equipment, families: tuple[str, ...] | None = None) -> None:
+        """Raise InputError if the station lacks an instrument of the sequence; `families`: in place of those that it
+        usually needs."""
+        if missing := station.lacks(*(cls.instruments if families is None else families)):
             raise InputError(
                 f"station: the sequence {cls.name!r} needs a {' and a '.join(missing)}; "
                 f"add [{missing[0]}] to the station file or leave the sequence out"

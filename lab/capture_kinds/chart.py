@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, ClassVar, Literal, Self
 
+from pydantic import model_validator
+
 from lab.capture_kinds.base import (
     Capture,
     Equipment,
@@ -19,6 +21,7 @@ from lab.capture_kinds.base import (
     planned_keys,
     spectrum_path,
 )
+from lab.capture_kinds.lamp import LAMP_INSTRUMENTS, ColourTemperature, LampLevel, check_lamp, lamp_channels, lamp_words
 from lab.errors import InputError
 from sim.parameters import Frozen, Quantity
 from sim.scene.scenes import Corners, ReflectanceChart, Scene
@@ -49,7 +52,8 @@ class ChartTarget(Target):
 
 
 class ChartSequence(Sequence):
-    """`frames` of the chart in white light, after a measurement of the radiance of a white diffuser."""
+    """`frames` of the chart in white light, after a measurement of the radiance of a white diffuser. With a
+    `lamp_level` above 0 in the light source's light of `colour_temperature_k`, else the first of the station file."""
 
     name: ClassVar[str] = "chart"
     purpose: ClassVar[str] = "check of colour and linearity that no fit uses"
@@ -58,20 +62,30 @@ class ChartSequence(Sequence):
 
     frames: Annotated[int, Quantity("1", "frames of the chart", lower=1, upper=1000)] = 4
     level: Level = 0.75
+    lamp_level: LampLevel = 0.0
+    colour_temperature_k: ColourTemperature = None
+
+    @model_validator(mode="after")
+    def _lamp_lit(self) -> Self:
+        check_lamp(self.lamp_level, self.colour_temperature_k)
+        return self
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
         return cls(frames=2 if quick else 4) if cls.possible(station) else None
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
-        self.check_instruments(station)
+        self.check_instruments(station, LAMP_INSTRUMENTS if self.lamp_level else None)
         name = station.one(ChartTarget)
         target = station.list_targets(ChartTarget)[name]
-        lit = Setting(target=name, wavelength_nm=0.0)
-        made = [exposure_step("colorchecker", "ColorChecker", lit, self.level)]
+        lit, stem = Setting(target=name, wavelength_nm=0.0), "colorchecker"
+        if self.lamp_level:
+            lit = Setting(target=name, lamp=lamp_channels(station, self.lamp_level, self.colour_temperature_k))
+            stem = f"{stem}/{lamp_words(self.lamp_level, self.colour_temperature_k)}"
+        made = [exposure_step(stem, "ColorChecker", lit, self.level)]
         light = spectrum_path(made[0].id)
         for frame in range(1, self.frames + 1):
-            id = f"colorchecker/{frame}"
+            id = f"{stem}/{frame}"
             captures = []
             for side in station.sides:
                 layout = target.left if side == "left" else target.right
@@ -80,7 +94,10 @@ class ChartSequence(Sequence):
                         f"station: target {name!r} has no [targets.{name}.{side}] corners; "
                         "add the four [row, col] of the patch grid as this camera sees it"
                     )
-                keys = {"kind": "chart", "chart": target.chart, "corners": layout.corners, "radiance": light}
+                keys = {
+                    **{"kind": "chart", "chart": target.chart, "corners": layout.corners, "radiance": light},
+                    "colour_temperature_k": self.colour_temperature_k,
+                }
                 captures.append(ChartCapture.model_validate(planned_keys(id, side) | keys))
             made.append(
                 Step(

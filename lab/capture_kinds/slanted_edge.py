@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lab.capture_kinds.base import (
     Adjustment,
@@ -24,6 +24,7 @@ from lab.capture_kinds.base import (
     planned_keys,
     spectrum_path,
 )
+from lab.capture_kinds.lamp import LAMP_INSTRUMENTS, ColourTemperature, LampLevel, check_lamp, lamp_channels, lamp_words
 from lab.errors import InputError
 from sim.camera import Side
 from sim.parameters import Frozen, Quantity
@@ -104,7 +105,8 @@ def _turned(row: float, col: float, turn: float) -> tuple[float, float]:
 class EdgeSequence(Sequence):
     """`frames` of every knife edge of the station, or of `edges` alone. A frame shows the edge in several regions; each
     region is a capture of its own. `wavelength_nm`: of the light, 0 is white. `turn_deg`: by how much an operator's
-    hand turns the edges for it, and back at its end."""
+    hand turns the edges for it, and back at its end. With a `lamp_level` above 0 the light source lights the edges: its
+    light of `colour_temperature_k`, or of `wavelength_nm`, else the first of the station file."""
 
     name: ClassVar[str] = "edge"
     purpose: ClassVar[str] = "MTF over the field and over orientations"
@@ -119,14 +121,21 @@ class EdgeSequence(Sequence):
         float,
         Quantity("deg", "turn of the knife edges by hand, their top to the right; 0: none", lower=-180.0, upper=180.0),
     ] = 0.0
+    lamp_level: LampLevel = 0.0
+    colour_temperature_k: ColourTemperature = None
     edges: tuple[str, ...] = ()  # names of the targets; empty: all
+
+    @model_validator(mode="after")
+    def _lamp_lit(self) -> Self:
+        check_lamp(self.lamp_level, self.colour_temperature_k)
+        return self
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
         return cls(frames=2 if quick else 4) if cls.possible(station) else None
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
-        self.check_instruments(station)
+        self.check_instruments(station, LAMP_INSTRUMENTS if self.lamp_level else None)
         return edge_steps(self, station, "edge", SlantedEdgeCapture)
 
 
@@ -146,15 +155,25 @@ def edge_steps(
         raise InputError(f"edge.edges: the station has no knife edge {unknown[0]!r}; it has {', '.join(there)}")
     light_nm = sequence.wavelength_nm
     stem = f"{stem}/{light_nm:g}nm" if light_nm else stem
+    if sequence.lamp_level:
+        stem = f"{stem}/{lamp_words(sequence.lamp_level, sequence.colour_temperature_k)}"
     if sequence.turn_deg:
         stem = f"{stem}/turned{sequence.turn_deg:g}"
         by_hand = (*by_hand, _turn_of(station, sequence.turn_deg))
     prefix = stem.partition("/")[2].replace("/", "-")
-    slit_um = station.limits.slit_um if light_nm else None
+    usual = Setting(
+        target=None,
+        wavelength_nm=light_nm,
+        slit_um=station.limits.slit_um if light_nm else None,
+        by_hand=by_hand,
+    )
+    if sequence.lamp_level:
+        channels = lamp_channels(station, sequence.lamp_level, sequence.colour_temperature_k, light_nm)
+        usual = Setting(target=None, by_hand=by_hand, lamp=channels)
     made: list[Step] = []
     for name in sequence.edges or there:
         edge = there[name]
-        lit = Setting(target=name, wavelength_nm=light_nm, slit_um=slit_um, by_hand=by_hand)
+        lit = usual.model_copy(update={"target": name})
         found = exposure_step(f"{stem}/{name}", f"slanted edge {name}", lit, sequence.level)
         light = spectrum_path(found.id)
         made.append(found)
@@ -171,6 +190,7 @@ def edge_steps(
                         "angle_deg": region.angle_deg,
                         "light_radiance": light,
                         "field_mm": region.field_mm,
+                        "colour_temperature_k": sequence.colour_temperature_k,
                     }
                     captures.append(kind.model_validate(planned_keys(id, side) | own | keys))
             made.append(

@@ -12,6 +12,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field
 
 from lab.capture_kinds.base import Adjustment, Equipment, Sequence, Step, Target, back_step
+from lab.capture_kinds.lamp import LAMP_INSTRUMENTS
 from lab.capture_kinds.slanted_edge import EdgeCapture, EdgeSequence, EdgeTarget, TurnTarget, edge_steps
 from lab.errors import InputError
 from sim.parameters import Quantity
@@ -49,7 +50,7 @@ class StoppedEdgeSequence(EdgeSequence):
         return None
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
-        self.check_instruments(station)
+        self.check_instruments(station, LAMP_INSTRUMENTS if self.lamp_level else None)
         stops = {stop.f_number: name for name, stop in station.list_targets(ApertureTarget).items()}
         opened = _stop_of(stops, self.f_number)
         _stop_of(stops, station.f_number)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,11 +14,12 @@ from rich.markup import escape
 
 from lab.capture.data_folder import open_store, store_to_read
 from lab.cli.bench_process import mock_bench
-from lab.cli.console import check_writable, err, out, write_json
-from lab.cli.sources import Json, StoreFolder, recordings_of, run_here
+from lab.cli.console import check_writable, err, make_folder, out, write_json
+from lab.cli.sources import EngineName, Json, StoreFolder, recordings_of, run_here
 from lab.cli.tables import print_fit, print_resolving, print_sequences
+from lab.engine import DEFAULT_ENGINE
 from lab.errors import InputError
-from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult, capture_here
+from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult, capture_here, session_recordings
 
 if TYPE_CHECKING:
     from lab.capture.session import Progress as CaptureProgress
@@ -127,7 +129,15 @@ def run(
     ] = "",
     only: Only = None,
     parameters: Set = None,
+    engine: EngineName = DEFAULT_ENGINE,
     conceal: Conceal = None,
+    standards: Annotated[
+        bool,
+        typer.Option(
+            "--standards",
+            help="capture what EMVA 1288, ISO 12233 and other standards ask for, and report their figures instead",
+        ),
+    ] = False,
 ) -> None:
     """The main job: capture, fit, validate, diagnose, report. Without a station file: on the mock bench.
 
@@ -140,6 +150,15 @@ def run(
 
     limits = resolve_limits(resolve, resolve_minutes, resolve_rounds)
     store = open_store(out_folder)
+    if standards:
+        if limits is not None or recordings or only or parameters:
+            raise InputError(
+                "--standards: takes its own sequences and no diagnosis; leave --resolve, --recordings, --only and "
+                "--set out, or take `calibench standards SESSION` on other captures"
+            )
+        wanted = CaptureRequest(session=resume, quick=quick, name=name, standards=True)
+        _report_session(store, station, conceal, PipelineRequest("capture", capture=wanted))
+        return
     if recordings:
         if station is None or limits is None:
             raise InputError(
@@ -160,7 +179,9 @@ def run(
             name=name,
         )
         request = PipelineRequest("pipeline", capture=session, resolve=limits)
+    request = replace(request, engine=engine)
     verb = ["run"]  # what goes on then fits and diagnoses, too
+    verb += [] if engine == DEFAULT_ENGINE else [f"--engine={engine}"]
     verb += ["--resolve"] if resolve else []
     verb += [] if resolve_minutes is None else [f"--resolve-minutes={resolve_minutes:g}"]
     verb += [] if resolve_rounds is None else [f"--resolve-rounds={resolve_rounds}"]
@@ -178,6 +199,28 @@ def run(
     print_resolving(found.diagnosis)
     out.print("" if found.session is None else f"\nsession: {found.session}")
     out.print(f"report: {found.report}")
+
+
+def _report_session(store: Store, station: Path | None, conceal: list[str] | None, request: PipelineRequest) -> None:
+    """Capture a session for the standards, and write their pages, their PDF where matplotlib is installed, and their
+    JSON into its folder."""
+    from lab.cli.standards import report_standards
+    from lab.report.standards_pdf import has_matplotlib
+
+    session = _carried_out(request, store, station, conceal, ["run", "--standards"]).session
+    assert session is not None
+    recordings = session_recordings(store, session)
+    fitted = run_here(PipelineRequest("fit", recordings=recordings, source=session), store).fit
+    assert fitted is not None
+    folder = store.folder(session) / "standards"
+    make_folder(folder)
+    with_pdf = has_matplotlib()
+    report_standards(
+        recordings, fitted, folder / "standards.json", folder, folder / "standards.pdf" if with_pdf else None
+    )
+    if not with_pdf:
+        err.print("pdf: none: matplotlib isn't installed; pip install 'calibench[pdf]'")
+    out.print(f"\nsession: {session}")
 
 
 def _settling(source: str, station_file: Path, limits: ResolveLimits, data: Path | None) -> PipelineRequest:

@@ -11,6 +11,7 @@ from rich.markup import escape
 from lab.capture.data_folder import existing_store
 from lab.cli.console import EXIT_CHECK, EXIT_INPUT, check_output, check_writable, err, make_folder, out, write_json
 from lab.cli.sources import (
+    EngineName,
     FitFile,
     Json,
     Model,
@@ -24,6 +25,7 @@ from lab.cli.sources import (
     run_here,
 )
 from lab.cli.tables import print_diagnosis, print_validation
+from lab.engine import DEFAULT_ENGINE
 from lab.errors import InputError
 from lab.pipeline import PipelineRequest, PipelineResult
 
@@ -76,6 +78,7 @@ def diagnose(
             "alarm",
         ),
     ] = 0,
+    engine: EngineName = DEFAULT_ENGINE,
     scheduler: Scheduler = None,
     data: StoreFolder = None,
 ) -> None:
@@ -89,6 +92,8 @@ def diagnose(
             f"--bootstrap {bootstrap}: {FEWEST_DRAWS} draws are the fewest that a threshold follows from; give more, "
             "or 0"
         )
+    if bootstrap and engine == "evidence":
+        raise InputError("--bootstrap: the engine evidence has no threshold to draw; leave it out, or take today's")
     stated = context.get_parameter_source("scheduler")
     if not bootstrap and stated is not None and stated.name == "ENVIRONMENT":
         scheduler = None  # CALIBENCH_SCHEDULER is for every command: one that has nothing to spread leaves it
@@ -113,6 +118,7 @@ def diagnose(
         pictures=False,
         bootstrap=bootstrap,
         workers=workers,
+        engine=engine,
     )
     found = run_here(request)
     assert found.diagnosis is not None
@@ -162,6 +168,7 @@ def report(
         bool,
         typer.Option("--stored", help="take the newest stored results of a finished session, in place of new ones"),
     ] = False,
+    engine: EngineName = DEFAULT_ENGINE,
     data: StoreFolder = None,
 ) -> None:
     """Fit, validate, diagnose, and write one page with pictures. What is given, or with --stored is stored, isn't
@@ -188,6 +195,7 @@ def report(
         diagnosis=read_given(DiagnosisResult, diagnosis),
         improved=read_models(recordings, cameras),
         report_file=out_file,
+        engine=engine,
     )
     for option, one in (
         ("--fit", request.fit),

@@ -15,7 +15,18 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from lab.cli import backups, calibrations, capturing, devices, diagnosis, effects, fitting, recordings, simulation
+from lab.cli import (
+    backups,
+    calibrations,
+    capturing,
+    devices,
+    diagnosis,
+    effects,
+    fitting,
+    recordings,
+    simulation,
+    standards,
+)
 from lab.cli.console import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, Terminated, err, out
 from lab.cli.help import complete_help
 from lab.cli.twin import commands as twin
@@ -30,7 +41,7 @@ app = typer.Typer(
 )
 
 
-for _group in (capturing, fitting, diagnosis, recordings, backups, simulation):
+for _group in (capturing, fitting, standards, diagnosis, recordings, backups, simulation):
     app.registered_commands += _group.commands.registered_commands
 app.add_typer(effects.commands)
 app.add_typer(effects.check_command)

@@ -9,6 +9,7 @@ import typer
 
 from lab.capture.data_folder import existing_store
 from lab.cli.console import pipeline_bar, warn
+from lab.engine import Engine
 from lab.errors import InputError
 from lab.pipeline import Capturer, PipelineRequest, PipelineResult, run_pipeline, source_recordings
 
@@ -39,6 +40,14 @@ Scheduler = Annotated[
         envvar="CALIBENCH_SCHEDULER",
         help="a Dask scheduler (tcp://HOST:PORT) whose workers do the parallel work in place of this computer; they "
         "have to see its files under the same path",
+    ),
+]
+EngineName = Annotated[
+    Engine,
+    typer.Option(
+        "--engine",
+        help="what diagnoses: `evidence`, one table of sets of effects with their posterior probabilities, or `today`, "
+        "the engine before it",
     ),
 ]
 FitFile = Annotated[Path | None, typer.Option("--fit", metavar="FILE", help="a fit's JSON, in place of fitting again")]

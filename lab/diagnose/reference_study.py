@@ -7,6 +7,7 @@ and exposures, screens and boards.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -60,9 +61,16 @@ TILTS_DEG = (
 )
 
 
-def reference_study(seed: int = 1, camera: CameraModel | None = None) -> RecordingSet:
+def reference_study(
+    seed: int = 1,
+    camera: CameraModel | None = None,
+    *,
+    reflectances: tuple[Spectrum, ...] | None = None,
+    reading: Callable[[FloatArray], FloatArray] = np.copy,
+) -> RecordingSet:
     """Return the recording set of the session, of both sides. `seed`: of its noise and of the random pattern; `camera`:
-    on both sides, None: `reference_camera()`."""
+    on both sides, None: `reference_camera()`. `reflectances`: of the chart's patches, None: the published ones;
+    `reading`: what the radiometer reads of a radiance."""
     rig = _rig(camera or reference_camera())
     frames: dict[str, Any] = {}
     spectra: dict[str, Spectrum] = {}
@@ -74,7 +82,7 @@ def reference_study(seed: int = 1, camera: CameraModel | None = None) -> Recordi
     pair: tuple[tuple[Side, CameraModel], ...] = (("left", rig.left), ("right", rig.right))
     cameras = {}
     for side, own in pair:
-        drawn = _SideSession(rig, own, side, np.random.default_rng([seed, side == "right"]))
+        drawn = _SideSession(rig, own, side, np.random.default_rng([seed, side == "right"]), reflectances, reading)
         drawn.session(targets)
         cameras[side] = drawn.stated()
         frames |= drawn.frames
@@ -115,8 +123,17 @@ def _rig(camera: CameraModel) -> StereoRig:
 class _SideSession:
     """One side's captures, drawn in the order in which a session takes them."""
 
-    def __init__(self, rig: StereoRig, camera: CameraModel, side: Side, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        rig: StereoRig,
+        camera: CameraModel,
+        side: Side,
+        rng: np.random.Generator,
+        reflectances: tuple[Spectrum, ...] | None,
+        reading: Callable[[FloatArray], FloatArray],
+    ) -> None:
         self.rig, self.camera, self.side, self.rng = rig, camera, side, rng
+        self.reflectances, self.reading = reflectances, reading
         self.pattern = sensor.FixedPattern.draw(camera, rng)
         self.frames: dict[str, Any] = {}
         self.spectra: dict[str, Spectrum] = {}
@@ -149,7 +166,7 @@ class _SideSession:
         """Draw all captures."""
         for exposure_s, temperature_c in DARKS:
             self.take("dark", Darkness(), exposure_s, 3, temperature_c)
-        lamp = self.noted(self.lamp)
+        lamp = self.read(self.lamp)
         flat = UniformField(self.lamp)
         full_s = self.exposure_for(self.lamp, 1.0)
         for level in (*LEVELS, *LEVELS[::-1]):
@@ -158,7 +175,7 @@ class _SideSession:
         self.sweep()
         light = self.lamp.scale(0.3)
         corners = ((30.0, 40.0), (30.0, 280.0), (210.0, 280.0), (210.0, 40.0))
-        scene = ReflectanceChart(corners, light)
+        scene = ReflectanceChart(corners, light, reflectances=self.reflectances)
         self.take(
             "chart",
             scene,
@@ -166,7 +183,7 @@ class _SideSession:
             2,
             chart="ColorChecker24",
             corners=corners,
-            radiance=self.noted(light),
+            radiance=self.read(light),
         )
         self.edges()
         self.screen(targets)
@@ -187,7 +204,7 @@ class _SideSession:
                 1,
                 wavelength_nm=w,
                 bandwidth_nm=10.0,
-                radiance=self.noted(light),
+                radiance=self.read(light),
             )
 
     def edges(self) -> None:
@@ -207,7 +224,7 @@ class _SideSession:
             row, col = max(int(down * ROWS), half), max(int(across * COLS), half)
             region = (row - half, col - half, row + half, col + half)
             place = (row - 0.5 * ROWS) * PITCH_UM * 1e-3, (col - 0.5 * COLS) * PITCH_UM * 1e-3
-            path, exposure_s = self.noted(light), self.exposure_for(light, 0.7)
+            path, exposure_s = self.read(light), self.exposure_for(light, 0.7)
             for angle in ANGLES_DEG:
                 scene = KnifeEdge((EdgeRegion(region, angle),), light.scale(DARK_SIDE), light)
                 self.take(
@@ -229,7 +246,7 @@ class _SideSession:
             zip(("checkerboard", "bernoulli"), targets.values(), strict=True)
         )
         files = dict(zip(("checkerboard", "bernoulli"), targets, strict=True))
-        where: dict[str, Any] = {"screen": {"pose": "p0", "cell_camera_px": CELL_PX, "radiance": self.noted(light)}}
+        where: dict[str, Any] = {"screen": {"pose": "p0", "cell_camera_px": CELL_PX, "radiance": self.read(light)}}
         exposure_s = self.exposure_for(light, 0.7)
         for kind, pattern in shown.items():
             high, wide = pattern.shape
@@ -285,6 +302,11 @@ class _SideSession:
                  **more}
             )  # fmt: skip
             self.elapsed_s += BOARD_STEP_S if kind == "charuco" else STEP_S
+
+    def read(self, light: Spectrum) -> str:
+        """Store what the radiometer reads of a light; its path in the recording set."""
+        wavelength_nm, value = light.arrays
+        return self.noted(Spectrum.of(wavelength_nm, self.reading(value)))
 
     def noted(self, spectrum: Spectrum) -> str:
         """Store a spectrum; its path in the recording set."""

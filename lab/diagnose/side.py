@@ -16,9 +16,12 @@ from lab.diagnose.discovery import Superseded, discover, law_of, superseded, tol
 from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.refit import size_covariance
 from lab.diagnose.inference.side_model import dataset_of, measurement_model
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.metadata import misstatements, unchecked
+from lab.diagnose.metadata.stated_light import impossible_efficiency, misstated_light
+from lab.diagnose.outcome.determined import combinations
 from lab.diagnose.outcome.goodness_of_fit import (
     detectability,
     held_out,
@@ -27,33 +30,34 @@ from lab.diagnose.outcome.goodness_of_fit import (
     residual_curves,
     side_models,
 )
-from lab.diagnose.outcome.improved_model import improved_model, residual_pictures
+from lab.diagnose.outcome.improved_model import improved_model
 from lab.diagnose.outcome.mismatches import (
     board_departure,
     corrected_by_laws,
     described,
     family_corrections,
-    impossible_efficiency,
     in_light_of_laws,
     left_to_smooth,
     located,
-    misstated_light,
     shown_in,
     unexplained,
     vetoed_names,
     with_laws,
 )
-from lab.diagnose.outcome.model_posterior import names_in_doubt
-from lab.diagnose.outcome.next_capture import Doubt, doubt_of
+from lab.diagnose.outcome.names_in_doubt import names_in_doubt
+from lab.diagnose.outcome.next_capture import Doubt
+from lab.diagnose.outcome.residual_pictures import residual_pictures
+from lab.diagnose.outcome.rivals_in_doubt import doubt_of
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import DiagnosisLists, FitResult, HeldOut, Mismatch, Skipped
+from lab.formats.results import Combination, DiagnosisLists, FitResult, HeldOut, Mismatch, Skipped
 from lab.observables.dataset import Dataset
 from lab.observables.flats.linearity import PHOTON_TRANSFER
 from lab.workers import Workers
 from sim.camera import Side
+from sim.effects.base import Effect
 from sim.memory import return_freed_memory
 
 #: Called with the current step in words.
@@ -70,6 +74,7 @@ class NamedCandidate:
     candidate: Candidate
     shown_in: tuple[str, ...]  # measurements in which its change exceeds the noise
     corrections: tuple[str, ...] = ()  # corrections of the improved model beside a family's nearest law, in words
+    combinations: tuple[Combination, ...] = ()  # determined, of parameters that aren't by themselves
 
 
 @dataclass(frozen=True)
@@ -212,7 +217,12 @@ def diagnose_side(
         gain_is_known=model.gain_is_known,
         threshold=verdict.threshold if np.isfinite(verdict.threshold) else None,
         named=tuple(
-            NamedCandidate(c, shown_in(verdict, c, policy), family_corrections(verdict, c, corrections, policy))
+            NamedCandidate(
+                c,
+                shown_in(verdict, c, policy),
+                family_corrections(verdict, c, corrections, policy),
+                _combined_sizes(side, model, verdict.effects, c.effect),
+            )
             for c in verdict.named
         ),
         abstained=verdict.abstained,
@@ -221,3 +231,14 @@ def diagnose_side(
         doubt=doubt_of(recordings, side, verdict, policy, station),
         settling=settling_sentence(recordings, side, left),
     )
+
+
+def _combined_sizes(
+    side: Side, model: MeasurementModel, effects: tuple[Effect, ...], effect: Effect
+) -> tuple[Combination, ...]:
+    """Return what the recordings determine of the sizes of one of `effects`, where they can't tell these apart."""
+    if effect not in effects:
+        return ()
+    coords, from_absence, covariance = size_covariance(model, effects, effects.index(effect))
+    parameters = [(c.name, c.quantity) for c in coords]
+    return combinations(side, parameters, from_absence, covariance, gain_is_known=model.gain_is_known)

@@ -20,8 +20,8 @@ from lab.observables.dataset import Dataset
 from lab.observables.observable import Observable
 from sim.effects.base import Effect
 from sim.effects.empirical_law import PLACES, Along, EmpiricalLaw, Of, Stage
+from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.effects.screen_gamma import ScreenGamma
-from sim.effects.transfer_discrepancy import TransferDiscrepancy
 from sim.spectrum import FloatArray
 
 #: Change of a node for the differences: small, so that they are derivatives; of factors 1 %.
@@ -106,7 +106,7 @@ ON_OBSERVABLES = (
     ),
     GroupDeclaration(
         "gain by line", 0.00005, "1, of the observable's scale", "healthy sets of two simulators",
-        observables=("green_balance", "flat_lines", "row_periods", "line_gains"),
+        observables=("green_balance", "flat_lines", "row_periods", "line_gains", "flat_pattern"),
     ),
     GroupDeclaration(
         "screens", 0.001, "1, of the observable's scale", "screens drawn to 1/55 px; drawn to 1/25 px they leave 0.7 %",
@@ -207,9 +207,10 @@ def _curve(
 
 def _directed(shape: str, at: Sequence[float]) -> _SmoothChange:
     def law(k: int, value: float) -> Effect:
-        change = [0.0] * len(at)
-        change[k] = value
-        return TransferDiscrepancy(shape=shape, at=tuple(at), change=tuple(change), strength=1.0)  # type: ignore[arg-type]
+        factor = [1.0] * len(at)
+        factor[k] += value
+        curve = {"at": tuple(at), "factor": tuple(factor), "strength": 1.0}
+        return ModelDiscrepancy.model_validate({"along": f"{shape}_frequency_cy_per_um"} | curve)
 
     return _SmoothChange(law, len(at), first=1)
 

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from lab.inference.hypotheses import Hypothesis
-from lab.inference.search import Search, Table
+from lab.inference.search import FittedSet, Search, Table
 from sim.spectrum import FloatArray
 
 #: Threshold of a name, and of more likely than not.
@@ -111,32 +111,9 @@ def inexact_probability(table: Table, name: str) -> float:
 
 def sizes_of(table: Table, hypotheses: Mapping[str, Hypothesis], name: str) -> tuple[Size, ...]:
     """Return an effect's parameters in their own units, as mixtures over the refitted sets that hold it."""
-    rng = np.random.default_rng(0)
-    weights: dict[frozenset[str], float] = {}
-    for row in table.rows:
-        if row.refitted and name in row.members:
-            weights[row.members] = weights.get(row.members, 0.0) + row.probability
-    total = sum(weights.values())
-    if total <= 0.0:
-        return ()
-    draws: list[FloatArray] = []
-    for members, weight in weights.items():
-        fit = table.fits[members]
-        first = 0
-        for other in fit.state:
-            if other == name:
-                break
-            first += len(fit.state[other].u)
-        own = slice(first, first + len(fit.state[name].u))
-        count = round(_DRAWS * weight / total)
-        if count:
-            u = fit.state[name].u + fit.laplace.mean[own]
-            draws.append(rng.multivariate_normal(u, fit.laplace.covariance[own, own], count, check_valid="ignore"))
-    if not draws:
-        return ()
-    every = np.concatenate(draws)
+    every = parameter_draws(table, name)
     found = []
-    for k, c in enumerate(hypotheses[name].coordinates):
+    for k, c in enumerate(hypotheses[name].coordinates if len(every) else ()):
         u = np.clip(every[:, k], c.lower, c.upper)
         low, high = np.quantile(u, [0.025, 0.975])
         determined = c.is_shape or not low <= 0.0 <= high
@@ -146,6 +123,44 @@ def sizes_of(table: Table, hypotheses: Mapping[str, Hypothesis], name: str) -> t
             Size(c.name, float(value.mean()), float(value.std()), (float(interval[0]), float(interval[1])), determined)
         )
     return tuple(found)
+
+
+def weights_of_sets(table: Table, name: str) -> dict[frozenset[str], float]:
+    """Return the refitted sets that hold an effect, with their probabilities given that one of them holds."""
+    weights: dict[frozenset[str], float] = {}
+    for row in table.rows:
+        if row.refitted and name in row.members:
+            weights[row.members] = weights.get(row.members, 0.0) + row.probability
+    total = sum(weights.values())
+    return {members: w / total for members, w in weights.items()} if total > 0.0 else {}
+
+
+def parameter_draws(table: Table, name: str) -> FloatArray:
+    """Draw an effect's parameters u (k, p) from the mixture of the refitted sets that hold it, each over its modes."""
+    rng = np.random.default_rng(0)
+    draws: list[FloatArray] = []
+    for members, weight in weights_of_sets(table, name).items():
+        best = table.fits[members]
+        modes = (best, *best.others)
+        log = np.array([best.base - best.shift, *(m.base for m in best.others)])
+        shares = np.exp(log - log.max())
+        for fit, share in zip(modes, shares / shares.sum(), strict=True):
+            own = parameter_slice(fit, name)
+            count = round(_DRAWS * weight * float(share))
+            if count:
+                u = fit.state[name].u + fit.laplace.mean[own]
+                draws.append(rng.multivariate_normal(u, fit.laplace.covariance[own, own], count, check_valid="ignore"))
+    return np.concatenate(draws) if draws else np.zeros((0, 0))
+
+
+def parameter_slice(fit: FittedSet, name: str) -> slice:
+    """Return where an effect's parameters stand among all of a fitted set."""
+    first = 0
+    for other in fit.state:
+        if other == name:
+            break
+        first += len(fit.state[other].u)
+    return slice(first, first + len(fit.state[name].u))
 
 
 def verdict(posterior: Posterior, least_nothing: float, check_passed: bool) -> Verdict:

@@ -15,6 +15,7 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.side_model import dataset_of, measurement_model
 from lab.diagnose.metadata import Misstatement, misstatements
 from lab.errors import NotDetermined
+from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult, Skipped
 from lab.inference.check import held_out_ids
@@ -138,17 +139,20 @@ def _with_own(predict: Callable[[Effects], Prediction], own: set[str]) -> Callab
 
 
 def measure_side(
-    recordings: RecordingSet, side: Side, fit: Callable[[RecordingSet], FitResult] | None
+    recordings: RecordingSet,
+    side: Side,
+    fit: Callable[[RecordingSet], FitResult] | None,
+    baseline: CameraFile | None = None,
 ) -> SideProblem | None:
-    """Hold captures out, fit the others by `fit` (None: no fit), and measure both. None where nothing can be
-    measured."""
+    """Hold captures out, fit the others by `fit` (None: no fit), and measure both. `baseline`: a camera file in the
+    place of data sheet and fit, with its effects. None where nothing can be measured."""
     recordings, misstated = misstatements(recordings, side)
     held = held_out_ids(recordings, side)
     used = recordings.without(held)
     fitted = None if fit is None else fit(used)
     order = _in_time_order(recordings, side)
-    dataset = _with_history(dataset_of(used, side, fitted), order)
-    model, skipped = measurement_model(used, side, fitted, None, dataset)
+    dataset = _with_history(dataset_of(used, side, fitted, baseline), order)
+    model, skipped = measurement_model(used, side, fitted, baseline, dataset)
     if model is None:
         return None
     return SideProblem(side, dataset, model, _held_out(recordings, held, dataset, order), misstated, skipped)

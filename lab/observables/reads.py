@@ -35,6 +35,8 @@ SHOWN = frozenset({"light.screen"})
 REFLECTIONS = frozenset({"image.copies"})
 #: Factors on the lens's transfer function.
 BLUR = frozenset({"image.transfer"})
+#: Sensitivity that differs by place and wavelength.
+PATTERNS = frozenset({"image.patterns"})
 #: Displacement of the image by place and wavelength.
 SHIFT = frozenset({"image.shift"})
 

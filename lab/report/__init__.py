@@ -25,7 +25,6 @@ from lab.formats.results import (
     DiagnosisResult,
     FitResult,
     KernelPair,
-    ParameterValue,
     ResidualCurve,
     Skipped,
     ValidationResult,
@@ -146,9 +145,6 @@ def page_environment() -> jinja2.Environment:
         trim_blocks=True,
     )
 
-    def parameter_value(value: ParameterValue) -> str:
-        return measured(value.value, value.std, value.unit, value.interval)
-
     def stated(value: float | None, unit: str) -> str:
         return "" if value is None else measured(value, None, unit)
 
@@ -158,7 +154,7 @@ def page_environment() -> jinja2.Environment:
         "effect_title": effect_title,
         "at_beginning": at_beginning,
         "parameter_name": words.parameter_name,
-        "parameter_value": parameter_value,
+        "parameter_value": words.parameter_value,
         "stated": stated,
         "stated_as": lambda value, std, unit: "–" if value is None else measured(value, std, unit),
         "still": still,

@@ -14,13 +14,14 @@ from lab.formats.results import (
     Check,
     DiagnosisResult,
     DiscoveredLaw,
+    EffectSet,
     FitResult,
     NamedEffect,
     ParameterValue,
     ResidualCurve,
     ValidationResult,
 )
-from lab.formats.results.words import measured, plain_number
+from lab.formats.results.words import plain_number
 from lab.observables.observable import measurement_title
 from lab.predict.validate import BothModels
 from lab.report import charts, words
@@ -36,6 +37,8 @@ PROOFS = 2  # charts
 ODDS = 4  # sets of effects a side
 #: Most effects that the first screen describes; the others follow in the diagnosis.
 NAMED = 4
+#: From this probability on, unlisted physics is told on the first screen.
+LIKELIER = 0.5
 #: Prefixes of the names of the key figures on the first screen.
 STRIP = ("system gain", "temporal dark noise", "saturation capacity", "dark current", "DSNU", "PRNU")
 
@@ -57,33 +60,35 @@ def _short(value: float) -> str:
 def _from_zero(value: ParameterValue, quantity: Quantity | None) -> str:
     """Return how many standard deviations lie between a size and none, in brackets; empty where it has no such
     distance."""
-    if quantity is None or quantity.absent != 0.0 or not value.std or value.interval is not None:
+    if quantity is None or quantity.absent != 0.0 or not value.std or value.shown_interval is not None:
         return ""
     return f" ({plain_number(abs(value.value) / value.std, 2)} σ from 0)"
 
 
 def odds(diagnosis: DiagnosisResult | None) -> list[tuple[Side, list[tuple[str, float]]]]:
-    """Return the probabilities of the models by side: the likeliest sets of effects, none further acting, the rivals,
-    and all the rest."""
+    """Return the probabilities of the models by side: the likeliest sets of effects, none further acting, and all the
+    rest; and the rivals, where these aren't among the sets."""
     found = []
     for one in diagnosis.models if diagnosis is not None else ():
         shown = one.sets[:ODDS]
-        rows = [
-            (
-                f"{' + '.join(effect_title(name) for name in item.effects)}, none further"
-                if item.effects
-                else "no effect: the baseline",
-                item.probability,
-            )
-            for item in shown
-        ]
-        rows.append(("all other sets of listed effects together", max(1.0 - sum(p for _, p in rows), 0.0)))
-        for effect in diagnosis.effects if diagnosis is not None else ():
+        rows = [(set_in_words(item), item.probability) for item in shown]
+        has_unlisted = diagnosis is not None and diagnosis.engine == "evidence"
+        rest = "all other sets together" if has_unlisted else "all other sets of listed effects together"
+        rows.append((rest, max(1.0 - sum(p for _, p in rows), 0.0)))
+        for effect in diagnosis.effects if diagnosis is not None and not has_unlisted else ():
             if one.side in effect.sides:
                 title = effect_title(effect.name)
                 rows += [(f"rival of {title}: {effect_title(r.name)}", r.probability) for r in effect.rivals]
         found.append((one.side, rows))
     return found
+
+
+def set_in_words(item: EffectSet) -> str:
+    """Return a set of effects with what is unlisted beside them."""
+    unlisted = [f"unlisted physics of the {state}" for state in item.unlisted]
+    if not item.effects:
+        return " + ".join(["no effect", *unlisted]) if unlisted else "no effect: the baseline"
+    return f"{' + '.join([*(effect_title(name) for name in item.effects), *unlisted])}, none further"
 
 
 def effect_line(effect: NamedEffect) -> str:
@@ -93,7 +98,8 @@ def effect_line(effect: NamedEffect) -> str:
     fields = law.choices() if law else {}
     sizes = [
         f"{described[name].meaning if name in described else words.parameter_name(name, value)} "
-        f"{measured(value.value, value.std, value.unit, value.interval)}{_from_zero(value, described.get(name))}{'' if value.sign_known else ', sign unknown'}"  # noqa: E501
+        f"{words.parameter_value(value)}{_from_zero(value, described.get(name))}"
+        f"{'' if value.sign_known else ', sign unknown'}"
         for name, value in effect.parameters.items()
         if value.std is None or abs(value.value) >= TOLD_SIGMA * value.std
     ]
@@ -115,6 +121,12 @@ def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
     if len(diagnosis.effects) > NAMED:
         more = ", ".join(effect_title(effect.name) for effect in diagnosis.effects[NAMED:])
         yield f"Also: {more}."
+    for state in diagnosis.unlisted:
+        if state.probability >= LIKELIER:
+            yield (
+                f"Unlisted physics acts on the {state.state} of the {state.side} camera: probability "
+                f"{state.probability:.2f}."
+            )
     if diagnosis.unexplained:
         places = sorted({f"{measurement_title(item.measurement)} ({item.side})" for item in diagnosis.unexplained})
         yield f"Without a name so far: {', '.join(places)}."
@@ -151,6 +163,10 @@ def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
         yield "The fits' own standard deviations; nothing was compared with a model."
         return
     yield from (_sure_of(effect) for effect in diagnosis.effects[:NAMED])
+    if diagnosis.engine == "evidence" and diagnosis.verdict == "no_mismatch":
+        for one in diagnosis.models:
+            nothing = sum(item.probability for item in one.sets if not item.effects and not item.unlisted)
+            yield f"No effect and nothing unlisted in the {one.side} camera: probability {nothing:.3f}."
     held = diagnosis.held_out
     if held is not None and held.n and (diagnosis.effects or held.chi2_discovered is not None):
         laws = held.chi2_discovered
@@ -353,6 +369,7 @@ def context(
         "headline": headline,
         "answers": answers(fit, validation, diagnosis, left_out, warnings, both),
         "odds": odds(diagnosis),
+        "odds_are_whole": diagnosis is not None and diagnosis.engine == "evidence",
         "proofs": proofs(fit, diagnosis, both),
         "strip": strip(fit),
     }

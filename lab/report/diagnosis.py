@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 
 from lab.diagnose.discovery.words import departure_unit
-from lab.diagnose.outcome.goodness_of_fit import detectable, told_as
+from lab.diagnose.outcome.detectability import detectable, told_as
 from lab.formats.results import (
     DiagnosisResult,
     DiscoveredLaw,
@@ -52,6 +52,7 @@ def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[st
         return {}
     threshold = diagnosis.threshold
     return {
+        "by_table": diagnosis.engine == "evidence",
         "place_map": place_maps(diagnosis, sides),
         "discovered": [(law, _law_chart(law)) for law in diagnosis.discovered],
         "residual_pictures": [_ResidualImages.of(picture) for picture in diagnosis.pictures],

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lab.formats.results import Check, DiagnosisResult, ParameterValue
-from lab.formats.results.words import plain_number
+from lab.formats.results.words import measured, plain_number
 from sim.camera import Side
 
 #: Verdict -> (what stands on the badge, its mood, the headline).
@@ -38,6 +38,12 @@ def parameter_name(name: str, value: ParameterValue) -> str:
     """Return a parameter's name as words, without the unit at its end: `displacement_x_um` is `displacement x`."""
     unit = "percent" if value.unit == "%" else value.unit
     return name.removesuffix(f"_{unit}").replace("_", " ")
+
+
+def parameter_value(value: ParameterValue) -> str:
+    """Return a parameter's value with its uncertainty; and that its size isn't determined, where it isn't."""
+    text = measured(value.value, value.std, value.unit, value.shown_interval)
+    return text if value.is_determined else f"{text}, not determined"
 
 
 CHECK_NAMES = {"colorchecker": "ColorChecker", "mtf": "MTF", "psf": "PSF"}

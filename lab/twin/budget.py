@@ -20,11 +20,11 @@ import numpy as np
 
 from lab.capture.catalogue import StepTimes
 from lab.capture.station import Station
-from lab.diagnose.inference.refit import coordinates, moved
 from lab.diagnose.outcome.model_posterior import STEP, coordinate_name, with_unnamed
 from lab.errors import InputError
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import ModelPosterior
+from lab.inference.coordinates import coordinates, moved
 from lab.observables.flats.noise import GAIN_STD, READ_STD
 from lab.observables.spectra.curves import freed_curve
 from lab.one_blas_thread import one_blas_thread

@@ -27,9 +27,9 @@ from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import FirstEstimates
 from lab.observables.charts.chart import CHART_SCALE_STD
 from lab.observables.charts.patches import reflectance_covariance
-from lab.observables.flats.linearity import RADIOMETER_STD
 from lab.observables.flats.noise import VARIANCE_FLOOR
 from lab.observables.noise.figures import BLACK_FLOOR_DN
+from lab.observables.spectra.light_readings import RADIOMETER_STD
 from sim.camera import CameraModel
 from sim.point import optical_transfer
 from sim.scene.colorchecker import reflectances

@@ -16,7 +16,6 @@ from scipy.optimize import nnls
 
 from lab.capture_kinds.base import Capture
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.refit import coordinates
 from lab.diagnose.outcome.model_posterior import coordinate_name, effect_jacobian, with_unnamed
 from lab.errors import InputError, NotDetermined
 from lab.fit import Step, fit_recording_set
@@ -24,6 +23,7 @@ from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
+from lab.inference.coordinates import coordinates
 from lab.observables.charts.chart import CHART
 from lab.observables.charts.patches import reflectance_covariance
 from lab.observables.codes.rounding import QUANTISATION_DN2

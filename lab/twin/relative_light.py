@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.refit import coordinates
 from lab.diagnose.outcome.model_posterior import coordinate_name, effect_jacobian, with_unnamed
 from lab.errors import InputError, NotDetermined
 from lab.formats.model_posterior import ModelPosterior
+from lab.inference.coordinates import coordinates
 from lab.observables.dataset import Dataset
 from lab.observables.flats.linearity import measure_photon_transfer, reading
 from lab.observables.observable import Observable

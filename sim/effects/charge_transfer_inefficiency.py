@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
+from scipy.special import ndtr
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
@@ -13,6 +15,7 @@ from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.sensor.electrons import NEIGHBOURS
 from sim.sensor.trails import Trails
+from sim.spectrum import FloatArray
 from sim.stages import Charge
 
 #: Release time that is tried first, in transfers.
@@ -27,7 +30,11 @@ class ChargeTransferInefficiency(Effect):
     Traps take electrons one by one, so that the shot noise of what arrives is independent from pixel to pixel. Where
     the same share of every packet lags behind, noise moves with it: neighbours share it (`noise`). Where capture is
     fast and each packet fills the traps to its own level, all that it finds is what the one before has left, whatever
-    their release: the noise of that one goes to the next alone (Massey et al., section 2).
+    their release: the noise of that one goes to the next alone (Massey et al., section 2), unless that is so faint that
+    the traps, which kept b = exp(-1 / tau) of the one before, hold more than it would fill: it takes none then.
+
+    `capture`: losses of many transfers act one after the other, or those of all at once, as models of many transfers
+    have it that don't follow each of them (Short et al.): the same for few transfers, less for many.
 
     The law of small packets, whose cloud grows with them: of traps that are always full, or of a cloud of constant
     volume, the loss isn't in proportion, and faint packets lose more.
@@ -37,10 +44,12 @@ class ChargeTransferInefficiency(Effect):
     family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
     reference: ClassVar[str] = (
         "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, chapter 5; R. Massey et al., An improved "
-        "model of charge transfer inefficiency, MNRAS 439 (2014) 887"
+        "model of charge transfer inefficiency, MNRAS 439 (2014) 887; A. Short et al., An analytical model of "
+        "radiation-induced charge transfer inefficiency for CCD detectors, MNRAS 430 (2013) 3078"
     )
     form_tolerance: ClassVar[float] = 0.15
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "time"})
+    forms: ClassVar[Mapping[str, object]] = {"capture": "all at once"}
     shapes: ClassVar[frozenset[str]] = frozenset({"release_px", "serial_release_px", "slow_share", "slow_release_px"})
     sentence: ClassVar[str] = (
         "Charge is lost from pixel to pixel on its way to the output: hot pixels and edges trail away from it, the "
@@ -84,6 +93,10 @@ class ChargeTransferInefficiency(Effect):
             "one that the next packet takes over as a whole"
         ),
     ] = "single electrons"
+    capture: Annotated[
+        Literal["transfer by transfer", "all at once"],
+        Field(description="traps take charge in every transfer, or those of all transfers in a single one"),
+    ] = "transfer by transfer"
     first_row: Annotated[Literal["top", "bottom"], Field(description="end of the frame whose row is read first")] = (
         "top"
     )
@@ -109,40 +122,45 @@ class ChargeTransferInefficiency(Effect):
         one = (1.0 - self.slow_share, release_px)
         return (one, (self.slow_share, self.slow_release_px)) if self.slow_share > 0.0 else (one,)
 
+    def _trails(self) -> tuple[Trails, ...]:
+        """Return the law of each direction that has a loss."""
+        at_once = self.capture == "all at once"
+        rows: Literal["first", "last"] = "first" if self.first_row == "top" else "last"
+        columns: Literal["first", "last"] = "first" if self.first_column == "left" else "last"
+        laws = (
+            Trails(0, 1e-6 * self.parallel_ppm, self._releases(self.release_px), rows, at_once),
+            Trails(1, 1e-6 * self.serial_ppm, self._releases(self.serial_release_px), columns, at_once),
+        )
+        return tuple(law for law in laws if law.loss != 0.0)
+
     def on_charge(self, charge: Charge) -> Charge:
-        if self.parallel_ppm != 0.0:
-            output: Literal["first", "last"] = "first" if self.first_row == "top" else "last"
-            charge = charge.add_laws(
-                trails=Trails(0, 1e-6 * self.parallel_ppm, self._releases(self.release_px), output)
-            )
-        if self.serial_ppm != 0.0:
-            output = "first" if self.first_column == "left" else "last"
-            charge = charge.add_laws(
-                trails=Trails(1, 1e-6 * self.serial_ppm, self._releases(self.serial_release_px), output)
-            )
+        laws = self._trails()
+        for law in laws:
+            charge = charge.add_laws(trails=law)
         if self.noise != "single electrons":
-            charge = self._share_noise(charge)
+            for law in laws:
+                charge = self._share_noise(charge, law)
         return charge
 
-    def _share_noise(self, charge: Charge) -> Charge:
-        """Return the charge's state with the frame's mean of what noise loses, and what the next pixels share of it.
+    def _share_noise(self, charge: Charge, law: Trails) -> Charge:
+        """Return the charge's state with the noise that packets share by one of the laws, as it is in the mean of the
+        frame."""
+        camera, to_the_next = charge.camera, self.noise == "to the next packet"
+        own, first, second = law.noise((camera.rows, camera.cols)[law.axis], to_the_next)
+        at = [(1, 4), (0, 3)][law.axis]  # of `NEIGHBOURS`
+        left = float(sum(share * np.exp(-1.0 / release) for share, release in law.releases))
 
-        A packet of which the share a lies in the next one has (1 - a)^2 + a^2 of the variance, and (1 - a) a of it in
-        common with either neighbour, to first order 1 - 2 a and a.
-        """
-        camera, shares = charge.camera, []
-        for ppm, release_px, lines in (
-            (self.serial_ppm, self.serial_release_px, camera.cols),
-            (self.parallel_ppm, self.release_px, camera.rows),
-        ):
-            lost = 1e-6 * ppm * 0.5 * (lines + 1.0)
-            released = sum(share * (1.0 - np.exp(-1.0 / release)) for share, release in self._releases(release_px))
-            beside = float(released) if self.noise == "moves along" else 1.0
-            shares.append((min(lost, 0.4), min(lost, 0.4) * beside))
-        lost_share = sum(lost for lost, _ in shares)
-        next_share = np.zeros(len(NEIGHBOURS))  # of further ones to first order none
-        next_share[:2] = [beside for _, beside in shares]
+        def filling(electrons: FloatArray) -> FloatArray:
+            # packets of Poisson numbers about the mean that lie above b times the mean
+            full = np.ones(np.shape(electrons))
+            return ndtr((1.0 - left) * np.sqrt(np.maximum(electrons, 0.0))) if to_the_next else full
+
+        def correlation(electrons: FloatArray) -> FloatArray:
+            shared = np.zeros((len(NEIGHBOURS), *np.shape(electrons)))
+            shared[at[0]], shared[at[1]] = first * filling(electrons), second * filling(electrons)
+            return shared
+
         return charge.add_laws(
-            variance_e2=lambda electrons, variance_e2: variance_e2 * (1.0 - lost_share) ** 2,
-            correlation=lambda electrons: np.multiply.outer(next_share, np.ones(np.shape(electrons))),
+            variance_e2=lambda electrons, variance_e2: variance_e2 * (1.0 - (1.0 - own) * filling(electrons)),
+            correlation=correlation,
         )

@@ -158,7 +158,7 @@ _TOLD = {
     ),
     Family.SOURCE_IN_WAVELENGTH: _Told(
         "source in wavelength",
-        "The narrowband source's spectrum, or the reading of it, isn't what is stated.",
+        "The source's spectrum, or the reading of it, isn't what is stated.",
         "the same wavelengths with an order-sorting filter, and with a narrower slit",
     ),
     Family.FIELD_OF_LIGHT: _Told(

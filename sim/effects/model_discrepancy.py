@@ -15,13 +15,25 @@ from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Charge, Image, Signal
 
-Along = Literal["frequency_cy_per_um", "radius_um", "signal_e", "variance_signal_e"]
+Along = Literal[
+    "frequency_cy_per_um",
+    "astigmatic_frequency_cy_per_um",
+    "diagonal_frequency_cy_per_um",
+    "chromatic_frequency_cy_per_um",
+    "radius_um",
+    "signal_e",
+    "variance_signal_e",
+]
+#: Wavelength at which a chromatic transfer is the model's, and the distance from it at which it has the whole factor.
+MIDDLE_NM, REACH_NM = 550.0, 150.0
 
 
 class ModelDiscrepancy(Effect):
     """A factor 1 + strength (f(x) - 1) on one stage: f linear between `at`, held beyond.
 
     `along` says on what, and what x is: `frequency_cy_per_um`, on the transfer function, alike in all directions;
+    `astigmatic_`, `diagonal_` and `chromatic_frequency_cy_per_um`, on the transfer function 1 + (f - 1) s with s =
+    cos 2 phi (rows against columns), sin 2 phi, phi the frequency's direction, or (wavelength - 550 nm) / 150 nm;
     `radius_um`, on the light by the distance from the optical axis; `signal_e`, on the mean signal;
     `variance_signal_e`, on the temporal variance by the mean signal. It describes and predicts; it explains nothing, so
     that a diagnosis never looks for it.
@@ -62,12 +74,22 @@ class ModelDiscrepancy(Effect):
     def _factor(self, x: FloatArray) -> FloatArray:
         return 1.0 + self.strength * (np.interp(x, self.at, self.factor) - 1.0)
 
+    def _transfer(self, fx: FloatArray, fy: FloatArray, wavelength_nm: float) -> FloatArray:
+        """Return the factor on the transfer function, over that at frequency 0, as light isn't lost."""
+        factor = self._factor(np.hypot(fx, fy)) / float(self._factor(np.zeros(1))[0])
+        if self.along == "frequency_cy_per_um":
+            return factor
+        if self.along == "chromatic_frequency_cy_per_um":
+            return np.asarray(1.0 + (factor - 1.0) * (wavelength_nm - MIDDLE_NM) / REACH_NM)
+        square = np.maximum(fx**2 + fy**2, 1e-30)
+        turned = (fx**2 - fy**2) / square if self.along.startswith("astigmatic") else 2.0 * fx * fy / square
+        return np.asarray(1.0 + (factor - 1.0) * turned)
+
     def on_image(self, image: Image) -> Image:
         if self.strength == 0.0:
             return image
-        if self.along == "frequency_cy_per_um":
-            at_zero = float(self._factor(np.zeros(1))[0])
-            return image.add_laws(transfer=lambda fx, fy, wavelength_nm: self._factor(np.hypot(fx, fy)) / at_zero)
+        if self.along.endswith("frequency_cy_per_um"):
+            return image.add_laws(transfer=self._transfer)
         if self.along == "radius_um":
 
             def shading(x_um: FloatArray, y_um: FloatArray) -> FloatArray:

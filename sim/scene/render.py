@@ -400,7 +400,7 @@ def _points(scene: PointArray, grid: Grid) -> FloatArray:
 
 
 def _chart(scene: ReflectanceChart, grid: Grid) -> Drawing:
-    patches = colorchecker.reflectances(scene.name)
+    patches = scene.reflectances or tuple(colorchecker.reflectances(scene.name).values())
     rows, cols = colorchecker.grid(scene.name)
     if not 0.0 <= scene.gap < 1.0:
         raise ValueError(
@@ -411,7 +411,7 @@ def _chart(scene: ReflectanceChart, grid: Grid) -> Drawing:
     warp = Warp.from_corners(cols - scene.gap, rows - scene.gap, scene.corners, scene.geometry)
     row, col = grid.axes_px()
     drawn = []
-    for index, reflectance in enumerate(patches.values()):
+    for index, reflectance in enumerate(patches):
         u, v = float(index % cols), float(index // cols)
         corner_row, corner_col = warp.to_camera([u, u + size, u + size, u], [v, v, v + size, v + size])
         window = _window(row, corner_row), _window(col, corner_col)

@@ -51,7 +51,7 @@ class ReflectanceChart:
     N1, N10, A10; for an upright chart: top left, top right, bottom right, bottom left). `illuminant_radiance`: of a
     perfect white diffuser at the chart. `gap`: share of the pitch of the patches that the frame between them takes.
     `geometry`: of a lens with distortion; the corners are then those in a pinhole camera, and every patch's corners
-    are distorted.
+    are distorted. `reflectances`: of this chart's own patches, in the chart's order; None: the published ones.
     """
 
     corners: Corners
@@ -60,6 +60,7 @@ class ReflectanceChart:
     gap: float = 0.13
     kind: str = "chart"
     geometry: Geometry | None = None
+    reflectances: tuple[Spectrum, ...] | None = None
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ def defect_sizes(shape: tuple[int, ...], share: float, seed: int, spread: float 
 
 
 @lru_cache(maxsize=256)
-def size_nodes(spread: float, count: int = 24) -> tuple[FloatArray, FloatArray]:
+def size_nodes(spread: float, count: int = 48) -> tuple[FloatArray, FloatArray]:
     """(weights, sizes), (count,) each, of the distribution of `defect_sizes`: means over parts of it, narrower ones
     towards the tail. The weights and the weighted sizes sum to 1."""
     if spread < ALIKE:
@@ -56,6 +56,19 @@ def size_nodes(spread: float, count: int = 24) -> tuple[FloatArray, FloatArray]:
     held = np.append(gammainc(k + 1.0, at), 1.0)
     weights = np.diff(below)
     return weights, np.diff(held) / weights
+
+
+@lru_cache(maxsize=256)
+def node_std(spread: float, count: int = 48) -> FloatArray:
+    """Standard deviation (count,) of the sizes within each part of `size_nodes`."""
+    if spread < ALIKE:
+        return np.zeros(1)
+    k = spread**-2
+    at = gammaincinv(k, 1.0 - np.linspace(1.0, 0.0, count + 1)[:-1] ** 2)
+    # E x^2 over a part is by the distribution of the order k + 2, of all sizes 1 + 1 / k
+    held = np.append(gammainc(k + 2.0, at), 1.0)
+    weights, sizes = size_nodes(spread, count)
+    return np.asarray(np.sqrt(np.maximum((1.0 + 1.0 / k) * np.diff(held) / weights - np.square(sizes), 0.0)))
 
 
 @dataclass(frozen=True)
@@ -82,6 +95,10 @@ class Defects:
         """Return the distribution of sizes by nodes: shares of all pixels (k,) and sizes (k,)."""
         weights, sizes = size_nodes(self.relative_std)
         return self.share * weights, self.mean_size * sizes
+
+    def node_std(self) -> FloatArray:
+        """Return the standard deviation of the sizes within each node's part of the distribution, (k,)."""
+        return self.mean_size * node_std(self.relative_std)
 
 
 @dataclass(frozen=True)

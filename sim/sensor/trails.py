@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,6 +15,11 @@ from sim.spectrum import FloatArray
 TRAIL_PX, TRAIL_GRID = 24, 1024
 #: Largest term of the series of `Trails.clock` that is left out.
 LEAST_TERM = 1e-12
+#: Numbers of transfers, evenly over a frame, and frequencies for which noise is averaged.
+NOISE_PLACES, NOISE_GRID = 24, 64
+#: Charge that is left behind on the way, over the packet's, beyond which noise is taken as of that: neighbours that
+#: share more aren't described by the shares of five of them.
+MOST_SHARED = 0.8
 
 
 @dataclass(frozen=True)
@@ -25,27 +30,47 @@ class Trails:
     axis : 0 where rows are clocked (parallel), 1 where columns are (serial)
     releases : (share of the traps, time constant of their release in transfers) of each species; the shares' sum is 1
     output : whether the first or the last line is next to the output, and so is transferred once
+    at_once : whether the traps of all of a packet's transfers act as those of a single one
 
     A packet that is transferred n times loses n loss, and the packet j places behind it finds sum_s w_s (1 - b_s)
     b_s^(j - 1) of that, b_s = exp(-1 / release). With T this delay, the limit of many small losses is exp(n loss (T -
     1)): the textbook's transfer function of deferred charge (Janesick 2001, chapter 5) with the traps' release in the
     place of a delay by one pixel.
+
+    `at_once`: the traps of n transfers fill to g N of N electrons that are left, g = n loss / b, and keep n loss / (1 +
+    g) of the packet; what they release finds them full: 1 + n loss / (1 + g) (T - 1). It is the model of A. Short et
+    al., MNRAS 430 (2013) 3078, of the same loss for few transfers, less for many.
     """
 
     axis: Literal[0, 1]
     loss: float
     releases: tuple[tuple[float, float], ...]
     output: Literal["first", "last"]
+    at_once: bool = False
 
     def transfers(self, line: FloatArray, lines: int) -> FloatArray:
         """Return the number of transfers of lines 0 .. lines - 1, which may lie between two."""
         return np.asarray(line + 1.0 if self.output == "first" else lines - line)
 
-    @property
-    def steady_share(self) -> float:
+    def steady_share(self, transfers: float) -> float:
         """Share of even light that is read, far from the first lines: a packet finds what it loses, but for what
         lies in the trail of the transfers that are still to come, the loss times the mean delay."""
-        return 1.0 - self.loss * sum(share / (1.0 - np.exp(-1.0 / release)) for share, release in self.releases)
+        lost = 0.0
+        for share, release in self.releases:
+            held = np.exp(-1.0 / release)
+            more = self.loss * share
+            if self.at_once:
+                more /= (1.0 + transfers * self.loss * share / held) ** 2
+            lost += more / (1.0 - held)
+        return 1.0 - lost
+
+    def _kept_at_once(self, transfers: FloatArray | float) -> list[tuple[FloatArray, float]]:
+        """Return the share of a packet that each species keeps of it, and b, where all transfers act at once."""
+        found = []
+        for share, release in self.releases:
+            held, lost = float(np.exp(-1.0 / release)), self.loss * share * np.asarray(transfers, float)
+            found.append((np.asarray(lost / (1.0 + lost / held)), held))
+        return found
 
     def clock(self, electrons: FloatArray) -> FloatArray:
         """Return the mean electrons (rows, cols) that are read, given those in the pixels.
@@ -56,7 +81,13 @@ class Trails:
         packets = np.moveaxis(electrons, self.axis, 0)
         if self.output == "last":
             packets = packets[::-1]
-        lost = self.loss * np.arange(1.0, len(packets) + 1.0)[:, None]
+        transfers = np.arange(1.0, len(packets) + 1.0)[:, None]
+        if self.at_once:
+            read = packets
+            for kept, held in self._kept_at_once(transfers):
+                read = read + _release(kept * packets, held) - kept * packets
+            return self._as_given(read)
+        lost = self.loss * transfers
         terms, size = 1, 2.0 * float(lost[-1, 0])
         while size > LEAST_TERM:
             terms += 1
@@ -67,6 +98,10 @@ class Trails:
         read = sources.pop()
         while sources:
             read = sources.pop() + self._delay(read) - read
+        return self._as_given(read)
+
+    def _as_given(self, read: FloatArray) -> FloatArray:
+        """Return lines in the order of their transfers as a frame (rows, cols)."""
         if self.output == "last":
             read = read[::-1]
         return np.asarray(np.maximum(np.moveaxis(read, 0, self.axis), 0.0))
@@ -75,28 +110,62 @@ class Trails:
         """Return where traps release the charge of packets (lines, n)."""
         total: FloatArray = np.zeros(packets.shape)
         for share, release in self.releases:
-            held = np.exp(-1.0 / release)
-            total = total + share * np.asarray(lfilter([0.0, 1.0 - held], [1.0, -held], packets, axis=0))
+            total = total + share * _release(packets, float(np.exp(-1.0 / release)))
         return total
 
     def otf(self, fx_cy_per_px: FloatArray, fy_cy_per_px: FloatArray, transfers: float) -> NDArray[np.complex128]:
         """Return the transfer function of charge that is transferred that often."""
         frequency = fy_cy_per_px if self.axis == 0 else fx_cy_per_px
         turn = np.exp((-2j if self.output == "first" else 2j) * np.pi * np.asarray(frequency, float))
+        return self._transfer(turn, transfers)
+
+    def _transfer(self, turn: NDArray[np.complex128], transfers: FloatArray | float) -> NDArray[np.complex128]:
+        """Return the transfer by the phase of one place back; `turn` and `transfers` broadcast."""
+        if self.at_once:
+            parts = [kept * ((1.0 - b) * turn / (1.0 - b * turn) - 1.0) for kept, b in self._kept_at_once(transfers)]
+            return np.asarray(1.0 + sum(parts))
         delayed: NDArray[np.complex128] = np.zeros(np.shape(turn), complex)
         for share, release in self.releases:
             held = np.exp(-1.0 / release)
             delayed = delayed + share * (1.0 - held) * turn / (1.0 - held * turn)
-        return np.asarray(np.exp(transfers * self.loss * (delayed - 1.0)))
+        return np.asarray(np.exp(np.asarray(transfers, float) * self.loss * (delayed - 1.0)))
+
+    def noise(self, lines: int, to_the_next: bool) -> tuple[float, float, float]:
+        """Return the variance of the noise that is read, mean over a frame of `lines`, over that of the packets; and
+        its correlation with the next packet and with the second one.
+
+        Where a share of each packet lags behind, noise has its transfer. `to_the_next`: each packet fills the traps,
+        and all that it finds is what the one before has left: its noise has the transfer of a delay by one place,
+        exp(n loss (z - 1)), or (1 - a) / (1 - a z) with a = n loss / (1 + g) where all transfers act `at_once`.
+        """
+        transfers = (np.arange(NOISE_PLACES)[:, None] + 0.5) / NOISE_PLACES * lines + 0.5
+        transfers = np.minimum(transfers, MOST_SHARED / self.loss)
+        frequency = np.arange(NOISE_GRID)[None, :] / NOISE_GRID
+        turn = np.exp(-2j * np.pi * frequency)
+        if not to_the_next:
+            amplitude = self._transfer(turn, transfers)
+        elif self.at_once:
+            kept = sum(kept for kept, _ in self._kept_at_once(transfers))
+            amplitude = (1.0 - kept) / (1.0 - kept * turn)
+        else:
+            amplitude = np.exp(transfers * self.loss * (turn - 1.0))
+        power = np.mean(np.square(np.abs(amplitude)), axis=0)
+        own, first, second = (float(np.mean(power * np.cos(2.0 * np.pi * k * frequency[0]))) for k in range(3))
+        return own, first / own, second / own
 
     def kernel(self, transfers: float) -> FloatArray:
         """Return where a packet's charge ends up, (2 `TRAIL_PX` + 1, 1) of rows or (1, 2 `TRAIL_PX` + 1) of columns:
         what is released beyond is left out.
         """
         frequency = np.asarray(np.fft.fftfreq(TRAIL_GRID), float)
-        along = Trails(0, self.loss, self.releases, "first").otf(np.zeros(TRAIL_GRID), frequency, transfers)
+        along = replace(self, axis=0, output="first").otf(np.zeros(TRAIL_GRID), frequency, transfers)
         behind = np.real(np.fft.ifft(along))[: TRAIL_PX + 1]
         kernel = np.concatenate([np.zeros(TRAIL_PX), behind])
         if self.output == "last":
             kernel = kernel[::-1]
         return np.asarray(kernel[:, None] if self.axis == 0 else kernel[None, :])
+
+
+def _release(packets: FloatArray, held: float) -> FloatArray:
+    """Return where one species releases the charge of packets (lines, n), of which it holds `held` a transfer."""
+    return np.asarray(lfilter([0.0, 1.0 - held], [1.0, -held], packets, axis=0))

@@ -8,6 +8,7 @@ CI.
 from __future__ import annotations
 
 import base64
+import hashlib
 import re
 import shutil
 import threading
@@ -21,18 +22,25 @@ from typing import Any, cast
 import pytest
 
 from api.client import ServiceClient
+from lab.calibration.camera_models import bring_in
 from lab.capture.by_hand import ByHand, left_by_hand
 from lab.capture.queue import put_into_queue
 from lab.capture.station import Drivers, Station, read_station
 from lab.formats.camera_file import CameraFile, default_camera, write_camera
-from lab.formats.recording_set import packed
+from lab.formats.recording_set import archive, packed
+from lab.formats.results import Resolution, ResolveJournal, RivalOdds
 from lab.pipeline import PipelineProgress, PipelineRequest, Step
+from lab.resolve import JOURNAL
+from lab.twin.changes import Changes
+from lab.twin.session import future_session
 from sim.sensor.mosaic import first_pixels
 from tests.api.conftest import STATION, Running, serving, until_state
 from tests.api.routes.test_confirm import PERSON, begun, confirm
 from tests.api.routes.test_findings import diagnosis
 from tests.lab.calibration.test_life import fitted
 from tests.lab.fake_bench import Bench
+from tests.lab.twin.test_twin import PLAN, TRUTH, trained
+from tests.lab.twin.test_twin import captured as twin_captured
 from tests.peers import browser_program
 
 pytestmark = pytest.mark.extra  # drives a browser
@@ -54,6 +62,18 @@ REFRESH = """async () => (await import("/static/page.js")).tellHalts(await (awai
 #: Has nothing follow the sessions that are started: a pipeline by default.
 NOTHING_FOLLOWS = """() => { const then = document.querySelector("#start-form select[name=then]");
     window.followed = then.value; then.value = ""; then.dispatchEvent(new Event("change", {bubbles: true})) }"""
+#: A station's light source.
+LAMP = """
+[light_source]
+driver = "fake"
+address = "lamp"
+[light_source.lights."3000 K"]
+colour_temperature_k = 3000
+channels = {460 = 0.14, 635 = 0.78}
+[light_source.lights."460 nm"]
+wavelength_nm = 460
+channels = {460 = 1.0}
+"""
 #: Where the planes of the fakes' frames begin, by channel.
 FIRSTS = first_pixels("RGGB")
 #: The views by their addresses, and what stands in each when it is complete. Words in capitals: ids.
@@ -79,6 +99,7 @@ VIEWS = {
     "/stations/fakes": "#devices tr:nth-child(5)",
     "/jobs": "#no-jobs",
     "/models": "#models tr",
+    "/predictions": "#no-predictions:not([hidden])",
     "/nothing": "#view-none a",
 }
 
@@ -702,6 +723,34 @@ def test_a_session_is_planned_on_the_page(browser: Any, lab: Running) -> None:
     watched.close()
 
 
+def test_a_light_source_is_shown_and_set_in_the_plan(browser: Any, lab: Running) -> None:
+    with_lamp = STATION.replace('address = "', 'address = "other ').replace("a bench of fakes", "lamp bench") + LAMP
+    (lab.store.root / "stations" / "lamp.toml").write_text(with_lamp)
+    watched = Watched(browser, lab)
+    watched.log_in(lab)
+    page = watched.page
+    page.reload()
+    page.wait_for_selector("#start-station option[value=lamp]", state="attached")
+    page.select_option("#start-station", "lamp")
+    page.wait_for_selector(
+        "#plan-lights:has-text('3000 K (460 at 14 %, 635 at 78 %); 460 nm (460 at 100 %)')", state="attached"
+    )
+    page.click("#plan > summary")
+    flat = page.locator("#plan-rows li", has=page.locator("strong:text-is('flat')"))
+    flat.locator("summary").click()
+    flat.locator("label:has(span[title=lamp_level]) input").fill("0.5")
+    flat.locator("label:has(span[title=colour_temperature_k]) input").fill("5000")
+    page.keyboard.press("Tab")
+    page.wait_for_selector("#plan-problem:has-text('no light of colour_temperature_k = 5000; it has 3000 K')")
+    flat.locator("label:has(span[title=colour_temperature_k]) input").fill("3000")
+    page.keyboard.press("Tab")
+    page.wait_for_selector("#plan-words:has-text('captures')")
+    assert page.inner_text("#plan-problem") == ""
+    assert watched.faults() == [] and watched.sideways_px() == 0
+    watched.complaints = [line for line in watched.complaints if "422" not in line]  # the refused colour temperature
+    watched.close()
+
+
 def test_the_steps_of_an_analysis_are_followed_to_its_report(
     browser: Any, lab: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -748,6 +797,105 @@ def test_the_steps_of_an_analysis_are_followed_to_its_report(
     watched.tab_to("Findings")
     watched.press("Enter", "#panel-findings:not([hidden])")
     assert watched.faults() == []
+    watched.close()
+
+
+def test_a_doubt_is_settled_on_the_page(
+    browser: Any, lab: Running, ids: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Resolve is pressed, and each capture stands there with what was in doubt before and after it. The pipeline itself
+    is a stand-in that takes one capture when it is told to."""
+    go_on = threading.Event()
+    doubt = (RivalOdds(name="charge_diffusion", probability=0.9), RivalOdds(name="defocus", probability=0.1))
+    taken = Resolution(
+        capture="slanted edges at f/8",
+        session=ids["SESSION"],
+        verdict_before="explained",
+        effects_before=(),
+        rivals=doubt,
+        information_nat=0.22,
+        expected_s=13.0,
+        spent_s=12.0,
+    )
+    journal = ResolveJournal(budget_min=20.0, resolutions=(taken,))
+    folder = lab.store.folder(ids["SESSION"])
+
+    def pipeline(request: PipelineRequest, tell: Callable[[PipelineProgress], None], **_: Any) -> None:
+        assert request.resolve is not None
+        (folder / JOURNAL).write_text(journal.model_dump_json())
+        tell(PipelineProgress(cast(Step, "resolve"), taken.capture, 0.5))
+        assert go_on.wait(60.0)
+        settled = taken.model_copy(update={"rivals_after": (RivalOdds(name="charge_diffusion", probability=1.0),)})
+        ended = {"resolutions": (settled,), "end": "settled", "reason": "no rivals are left"}
+        (folder / JOURNAL).write_text(journal.model_copy(update=ended).model_dump_json())
+
+    monkeypatch.setattr("lab.jobs.run_pipeline", pipeline)
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab)
+    watched.go(f"/sessions/{ids['SESSION']}/findings", "#findings-headline strong")
+    assert page.is_hidden("#resolving")
+    page.click("#session-actions button:has-text('Resolve')")
+    page.wait_for_selector("#resolving-rows td:has-text('charge diffusion 0.90, defocus 0.10 (left)')")
+    page.wait_for_selector("#resolving-rows td:has-text('being diagnosed')")
+    assert "goes on" in page.inner_text("#resolving-end")
+    go_on.set()
+    page.wait_for_selector("#resolving-rows td:has-text('charge diffusion 1.00')")
+    assert page.inner_text("#resolving-end") == "settled: no rivals are left. Lab time: 0.2 min of 20 min."
+    assert watched.faults() == [] and watched.sideways_px() == 0
+    watched.close()
+
+
+def test_a_budget_is_shown_and_a_prediction_sealed_and_opened(browser: Any, lab: Running, tmp_path: Path) -> None:
+    model = bring_in(lab.store, {"left": trained(1)})
+    with ServiceClient(lab.url, lab.keys["calibrate"], timeout_s=120.0) as sender:
+        for name, recordings in (
+            ("plan", future_session(TRUTH, PLAN, "left", Changes(), 1)),
+            ("taken", twin_captured(Changes(f_number=8.0, radiance_factor=4.0), 7)),
+        ):
+            (tmp_path / f"{name}.zip").write_bytes(b"".join(archive(recordings, "zip")))
+        plan, taken = (sender.send_recordings(tmp_path / f"{name}.zip").id for name in ("plan", "taken"))
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab, "calibrate")
+    watched.go("/models", f"#models a:text-is('{model}')")
+    page.click(f"#models a:text-is('{model}')")
+    page.wait_for_selector("#predict-plan option", state="attached")
+    page.select_option("#budget-form select[name=use]", "variance")
+    page.select_option("#budget-station", "fakes")
+    page.click("#budget-form button")
+    page.wait_for_selector("#budget h4:has-text('variance, left camera: standard uncertainty')")
+    page.wait_for_selector("#budget p:has-text('limits it')")
+    assert page.locator("#budget table").count() == 2  # contributions, and the station's sequences
+    assert watched.faults() == [] and watched.sideways_px() == 0
+
+    page.select_option("#predict-plan", f"recordings/{plan}")
+    page.fill("#predict-form input[name=f_number]", "8")
+    page.fill("#predict-form input[name=distance_mm]", "9")
+    page.click("#predict-form button")
+    page.wait_for_selector("#model-problem:has-text('twice the focal length')")
+    page.fill("#predict-form input[name=distance_mm]", "")
+    page.fill("#predict-form input[name=radiance_factor]", "4")
+    page.click("#predict-form button")
+    page.wait_for_selector("#view-prediction:not([hidden]) .hash")
+    assert re.fullmatch("[0-9a-f]{64}", page.inner_text("#prediction-facts .hash"))
+    assert "f number 8, radiance factor 4" in page.inner_text("#prediction-facts")
+    with page.expect_download() as fetched:
+        page.click("#prediction-actions a:has-text('Sealed file')")
+    sealed = Path(fetched.value.path()).read_bytes()
+    assert hashlib.sha256(sealed).hexdigest() == page.inner_text("#prediction-facts .hash")
+    page.select_option("#score-against", f"recordings/{plan}")
+    page.click("#score-form button")
+    page.wait_for_selector("#prediction-problem:has-text('the session that was predicted')")
+    page.select_option("#score-against", f"recordings/{taken}")
+    page.click("#score-form button")
+    page.wait_for_selector("#score li:has-text('dark current temperature, left camera: confirmed')")
+    assert page.inner_text("#prediction-problem") == "" and page.locator("#score tbody tr").count() > 1
+    assert watched.faults() == [] and watched.sideways_px() == 0
+    page.on("dialog", lambda asked: asked.accept())
+    page.click("#prediction-actions button:has-text('Delete')")
+    page.wait_for_selector("#no-predictions:not([hidden])")
+    watched.complaints = [line for line in watched.complaints if "422" not in line]  # the two that were refused
     watched.close()
 
 

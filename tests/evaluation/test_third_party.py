@@ -10,7 +10,7 @@ import pytest
 
 from evaluation.third_party.camera import BLACK_DN, draw_camera, record_sensor
 from evaluation.third_party.models import SimulatedSensor, SimulatorCheck
-from evaluation.third_party.score import Diagnosed, ScoredSize, table
+from evaluation.third_party.score import Diagnosed, ScoredSize, share_with_interval, table
 from tests.peers import missing
 
 ONE = Diagnosed(
@@ -27,7 +27,17 @@ def test_names_of_the_effect_and_its_family_are_right_and_others_are_second_name
     unlike = replace(ONE, set=4, is_checked=False, names={})
     assert [one.is_named for one in (ONE, family, wrong)] == [True, True, True]
     row = table([ONE, family, wrong, unlike]).splitlines()[-1]
-    assert row == "| Pyxel | persistence | 4 | 3 of 4 | 3 | `source_drift` 1 | 0 | 1 of 2 | 3 |"
+    assert row == (
+        "| Pyxel | persistence | 4 | 3 of 4 | 3 of 3 (29-100 %) | `source_drift` 1 | 0 | 1 of 2 (1-99 %) | 3 |"
+    )
+
+
+def test_rates_have_the_binomial_interval() -> None:
+    """Of none in n the upper end is 1 - 0.025^(1 / n): of 10 it is 30.8 %. Textbooks' 8 of 10: 44.4 to 97.5 %."""
+    assert share_with_interval(0, 10) == "0 of 10 (0-31 %)"
+    assert share_with_interval(8, 10) == "8 of 10 (44-97 %)"
+    assert share_with_interval(10, 10) == "10 of 10 (69-100 %)"
+    assert share_with_interval(0, 0) == "-"
 
 
 def test_a_simulator_that_errs_by_more_than_its_tolerance_is_not_right() -> None:
@@ -60,7 +70,7 @@ def test_simulators_do_what_they_are_asked_for() -> None:
             missing(f"{package} isn't installed; `make third-party` installs it")
     from evaluation.third_party.experiment import draw_set
 
-    for source in ("inter_pixel_capacitance", "moffat_blur"):
+    for source in ("inter_pixel_capacitance", "moffat_blur", "cosmic_rays", "column_gain"):
         recordings, truth, checked = draw_set(source, 1)
         assert checked.is_right
         assert truth and recordings.captures("flat")

@@ -229,14 +229,14 @@ class FakeCamera(_Fake, Camera):
     def __init__(self, bench: Bench, side: str) -> None:
         super().__init__(bench)
         self.side, self.who = side, f"camera {side}"
-        self.exposure_s = 0.0
+        self.exposure_s, self.gain_db = 0.0, 0.0
 
     def sensor(self) -> SensorInfo:
         return SensorInfo(ROWS, COLS, "BayerRG12", "RGGB", 12)
 
     def configure(self, exposure_s: float, gain_db: float = 0.0) -> None:
         self.bench.check(self.who)
-        self.exposure_s = exposure_s
+        self.exposure_s, self.gain_db = exposure_s, gain_db
 
     def arm(self, trigger: Any = "software") -> None:
         self.bench.check(self.who)
@@ -248,9 +248,9 @@ class FakeCamera(_Fake, Camera):
 
     def collect(self) -> Frame:
         self.bench.check(self.who)
-        dn = BLACK + SLOPE[self.side] * self.bench.light * self.exposure_s
+        dn = BLACK + SLOPE[self.side] * self.bench.light * self.exposure_s * 10.0 ** (self.gain_db / 20.0)
         raw = np.clip(self.bench.rng.normal(dn, 2.0, (ROWS, COLS)), 0, WHITE).astype(np.uint16)
-        return Frame(raw, self.exposure_s, 0.0, 25.0, datetime.now(UTC), "BayerRG12", self.bench.shots)
+        return Frame(raw, self.exposure_s, self.gain_db, 25.0, datetime.now(UTC), "BayerRG12", self.bench.shots)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,16 @@ import pytest
 
 from mocks.bench import Bench, BenchError, Clock
 from mocks.conceal import SIDES
-from mocks.light_path import WAVELENGTH_NM, LightSettings, sphere_radiance
-from mocks.targets import BOARD_POSES, BOARD_SQUARES, EDGE_ANGLES_DEG, SQUARE_MM, STOPS, board_pose, corners_px
+from mocks.lamp import tristimulus
+from mocks.light_path import (
+    LED_FWHM_NM,
+    LED_RADIANCE,
+    USUAL_LED_FWHM_NM,
+    WAVELENGTH_NM,
+    LightSettings,
+    sphere_radiance,
+)
+from mocks.targets import BOARD_POSES, BOARD_SQUARES, EDGE_ANGLES_DEG, MIXES, SQUARE_MM, STOPS, board_pose, corners_px
 from mocks.truth import hidden_truth
 from sim.camera import Side
 from sim.frame import Exposure, predict_frame
@@ -75,6 +83,34 @@ class TestLightPath:
 
     def test_blank_place_passes_nothing(self) -> None:
         assert not light(filter_place=6).any()
+
+    @pytest.mark.parametrize("led_nm", [460, 550, 635])
+    def test_an_led_has_its_total_at_its_wavelength_and_its_width(self, led_nm: int) -> None:
+        line = sphere_radiance(LightSettings(leds=((led_nm, 0.5),)), WAVELENGTH_NM)
+        # The grid's sum of a normal line is exact; of the widest, 1.3e-6 lies below 350 nm, 4.7 sigma away.
+        assert 0.5 * line.sum() == pytest.approx(0.5 * LED_RADIANCE, rel=2e-6)
+        above = WAVELENGTH_NM[line >= line.max() / 2]
+        # half-power points lie on a grid of 0.5 nm at either end
+        width_nm = LED_FWHM_NM.get(led_nm, USUAL_LED_FWHM_NM)
+        assert above[-1] - above[0] == pytest.approx(width_nm, abs=1.0)
+        assert np.average(WAVELENGTH_NM, weights=line) == pytest.approx(led_nm, abs=0.01)
+
+    def test_leds_add_to_what_the_shutter_lets_through(self) -> None:
+        leds = ((460, 0.2), (635, 1.0))
+        alone = sphere_radiance(LightSettings(leds=leds, wavelength_nm=500.0), WAVELENGTH_NM)
+        both = sphere_radiance(LightSettings(leds=leds, shutter_open=True, filter_place=2), WAVELENGTH_NM)
+        np.testing.assert_allclose(both - alone, light(filter_place=2), rtol=0, atol=1e-15)
+        one_by_one = [sphere_radiance(LightSettings(leds=(led,)), WAVELENGTH_NM) for led in leds]
+        np.testing.assert_allclose(alone, np.sum(one_by_one, axis=0), rtol=0, atol=1e-15)
+
+    @pytest.mark.parametrize("kelvin", sorted(MIXES))
+    def test_a_mix_has_the_colour_temperature_that_the_station_file_states(self, kelvin: float) -> None:
+        mix = LightSettings(leds=tuple(MIXES[kelvin].items()))
+        x, y, z = tristimulus(Spectrum.of(WAVELENGTH_NM, sphere_radiance(mix, WAVELENGTH_NM)))
+        at_x, at_y = x / (x + y + z), y / (x + y + z)
+        n = (at_x - 0.3320) / (0.1858 - at_y)
+        # McCamy (1992): the correlated colour temperature, to 2 K of its definition; mixed to within 100 K
+        assert 449 * n**3 + 3525 * n**2 + 6823.3 * n + 5520.33 == pytest.approx(kelvin, abs=100.0)
 
     def test_zero_order_is_white(self) -> None:
         white = light(filter_place=2)

@@ -144,7 +144,7 @@ def test_the_bench_is_a_whole_station(start: Start, tmp_path: Path) -> None:
     lines = lines_until_ready(process)
     assert lines[-2:] == [f"station {station_file}", "ready"]
     assert {line.split()[0] for line in lines[:-2]} == {
-        *("monochromator", "spectroradiometer", "display", "stage"),
+        *("monochromator", "spectroradiometer", "light_source", "display", "stage"),
         *("cameras.left", "cameras.right"),
     }
     station = read_station(station_file)
@@ -162,6 +162,13 @@ def test_the_bench_is_a_whole_station(start: Start, tmp_path: Path) -> None:
             assert camera.capture().raw.dtype == np.uint16
         lab.monochromator.close_shutter()
         assert max(lab.spectroradiometer.measure().radiance_w_sr_m2_nm.value) < 1e-3 * max(lit.value)
+        assert lab.light_source is not None
+        for channel, share in station.lights["3000 K"].channels.items():
+            lab.light_source.set_level(share, channel)
+        shone = lab.spectroradiometer.measure().radiance_w_sr_m2_nm
+        assert abs(shone.wavelength_nm[int(np.argmax(shone.value))] - 635) <= 2  # the narrowest of the bright LEDs
+        lab.light_source.stop()
+        assert max(lab.spectroradiometer.measure().radiance_w_sr_m2_nm.value) < 1e-3 * max(shone.value)
         lab.stage.place("screen")
         lab.display.show(np.ones((8, 8), np.uint8), 64)
         assert max(lab.spectroradiometer.measure().radiance_w_sr_m2_nm.value) > 0

@@ -16,6 +16,7 @@ import pytest
 from lab.fit.spectral.recordings import fit_spectral
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import NoiseFit
+from lab.observables.spectra.light_readings import RADIOMETER_STD
 from sim.frame import Exposure, sample
 from sim.scene import Darkness, UniformField
 from sim.scene.light import colour_science
@@ -25,7 +26,6 @@ from tests.lab.fit.spectral.test_sensitivity import DATA
 
 DRAWS = 240
 WAVE = np.arange(370.0, 771.0, 2.0)
-RADIOMETER_RELATIVE_STD = 0.003  # what the fit takes for granted
 GAIN_RELATIVE_STD = 0.002
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
@@ -98,7 +98,7 @@ def draw(curves: Camera, maker: Camera, lights: Lights, rng: np.random.Generator
         shape = lights.shape(centre)
         power = 1.2e5 / rate * shape / np.trapezoid(shape, WAVE) * PHOTON_ENERGY_J_NM / WAVE
         path = f"nb{centre:.0f}.csv"
-        spectra[path] = Spectrum.of(WAVE, power * (1.0 + RADIOMETER_RELATIVE_STD * rng.standard_normal()))
+        spectra[path] = Spectrum.of(WAVE, power * (1.0 + RADIOMETER_STD * rng.standard_normal()))
         add("narrowband", UniformField(Spectrum.of(WAVE, power)), wavelength_nm=centre, radiance=path)
     known = stated(rows=64, cols=64, quantum_efficiency={c: f"qe_{c}.csv" for c in maker})
     return RecordingSet(Manifest(cameras={"left": known}, captures=tuple(captures)), frames, spectra)

@@ -14,9 +14,10 @@ from lab.diagnose.inference.discrepancy import (
     predictive_discrepancy,
 )
 from lab.diagnose.inference.held_out import VetoedCandidate, held_out_mismatches, predicts_held_out, vetoed
-from lab.diagnose.inference.locate import Slice, mismatches
+from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.outlying import OutlyingLevel, freed, outlying_levels
+from lab.diagnose.inference.places import Slice
 from lab.diagnose.inference.refit import Fit, is_of_usual_size, log_likelihood, profile_interval, refit, refit_alone
 from lab.diagnose.inference.score import prototype_changes, signatures, signatures_of
 from lab.diagnose.inference.search import ModelSet, Search

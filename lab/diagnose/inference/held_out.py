@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lab.diagnose.inference.discrepancy import predictive_discrepancy
-from lab.diagnose.inference.locate import Slice, log_tail
 from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.places import Slice, log_tail
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.policy import DecisionPolicy
 from lab.observables.gaussian import ROUNDING, chi2, conditional

@@ -15,10 +15,10 @@ from scipy.optimize import brentq, least_squares
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
+from lab.inference.coordinates import EffectCoordinate, coordinate_prior, coordinates, moved
 from lab.observables.gaussian import Gaussian
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Effects
-from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
 #: The covariance depends on the parameters through form tolerances: it is updated this often, for a fit to convergence
@@ -26,63 +26,12 @@ from sim.spectrum import FloatArray
 PASSES, ROUGH_PASSES = 3, 2
 #: Evaluations of the prediction in the first pass, likewise; and in later ones.
 EVALUATIONS, ROUGH_EVALUATIONS, LATER_EVALUATIONS = 12, 8, 5
-#: The prior's width in a fit, in declared standard deviations: a camera at hand needn't be typical.
-PRIOR_WIDTH = 3.0
-#: A typical size of the logarithm of a parameter, and the least value of which there is one.
-TYPICAL_LOG, LEAST = 0.1, 1e-9
 #: Step of finite differences, in typical sizes of the coordinate.
 DIFFERENCE_STEP = 0.02
 #: Shares of the declared form tolerances that are tried, from the whole to the policy's least, by equal factors.
 TOLERATED_SHARES = 3
 #: Profile intervals end at this many times the fitted distance from absence.
 MOST_WIDENED = 100.0
-
-
-@dataclass(frozen=True)
-class Coordinate:
-    """One parameter of one effect as u = sign(p - absent) |p - absent|^linear_power, in which predictions have a slope
-    at `absent`; as u = ln p where it is declared logarithmic."""
-
-    index: int  # of the effect in its set
-    name: str
-    quantity: Quantity
-
-    @property
-    def absent(self) -> float:
-        """The parameter's value that means that the effect isn't there."""
-        return self.quantity.absent or 0.0
-
-    def to_u(self, value: float) -> float:
-        """u of a parameter's value."""
-        if self.quantity.logarithmic:
-            return float(np.log(max(value, LEAST)))
-        away = value - self.absent
-        return float(np.sign(away) * abs(away) ** self.quantity.linear_power)
-
-    def to_value(self, u: float) -> float:
-        """Return the parameter's value of u, within its bounds."""
-        if self.quantity.logarithmic:
-            value = float(np.exp(u))
-        else:
-            value = self.absent + float(np.sign(u) * abs(u) ** (1.0 / self.quantity.linear_power))
-        low = self.quantity.lower if self.quantity.lower is not None else -np.inf
-        high = self.quantity.upper if self.quantity.upper is not None else np.inf
-        return min(max(value, low), high)
-
-    @property
-    def bounds(self) -> tuple[float, float]:
-        """Of u."""
-        low, high = self.quantity.lower, self.quantity.upper
-        return (-np.inf if low is None else self.to_u(low), np.inf if high is None else self.to_u(high))
-
-    def typical(self, value: float) -> float:
-        """Return a typical size of u for a parameter at `value`."""
-        if self.quantity.logarithmic:
-            return TYPICAL_LOG
-        width = self.quantity.prior[1] if self.quantity.prior is not None else 5.0
-        if self.quantity.linear_power == 1:
-            return width
-        return max(abs(self.to_u(value)), 0.05 * width**self.quantity.linear_power)
 
 
 @dataclass(frozen=True)
@@ -109,25 +58,14 @@ class Fit:
         """Names of the effects."""
         return tuple(e.name for e in self.effects)
 
-    def jacobian_columns(self, effects: Effects, coords: Sequence[Coordinate]) -> dict[Coordinate, FloatArray]:
+    def jacobian_columns(
+        self, effects: Effects, coords: Sequence[EffectCoordinate]
+    ) -> dict[EffectCoordinate, FloatArray]:
         """Columns of the Jacobian for the coordinates of those of `effects` that are members of this set with the same
         parameters."""
         fitted = [(e, name) for e, std in zip(self.effects, self.std, strict=True) for name in std]
         column = dict(zip(fitted, self.jacobian.T, strict=True))
         return {c: column[key] for c in coords if (key := (effects[c.index], c.name)) in column}
-
-
-def coordinates(effects: Effects, camera: CameraModel) -> list[Coordinate]:
-    """Return all coordinates of a set of effects, within the bounds that hardware sets for this camera."""
-    return [Coordinate(i, name, q) for i, e in enumerate(effects) for name, q in type(e).quantities_of(camera).items()]
-
-
-def moved(effects: Effects, coords: Sequence[Coordinate], u: FloatArray) -> tuple[Effect, ...]:
-    """Return the effects with these coordinates at `u`."""
-    values: list[dict[str, float]] = [{} for _ in effects]
-    for c, at in zip(coords, u, strict=True):
-        values[c.index][c.name] = c.to_value(float(at))
-    return tuple(e.replace_fields(**v) for e, v in zip(effects, values, strict=True))
 
 
 def log_likelihood(model: MeasurementModel, effects: Effects, policy: DecisionPolicy) -> float:
@@ -268,11 +206,11 @@ def profile_interval(
 def _fit(
     model: MeasurementModel,
     effects: tuple[Effect, ...],
-    coords: Sequence[Coordinate],
+    coords: Sequence[EffectCoordinate],
     policy: DecisionPolicy,
     rough: bool,
     passes: int | None,
-    known: Mapping[Coordinate, FloatArray] = MappingProxyType({}),
+    known: Mapping[EffectCoordinate, FloatArray] = MappingProxyType({}),
     of_any_size: bool = False,
     tolerance: float | None = None,
 ) -> Fit:
@@ -349,19 +287,6 @@ def is_of_usual_size(effects: Effects, camera: CameraModel) -> bool:
     return bool(np.all(np.abs(u - centre) <= std))
 
 
-def coordinate_prior(coords: Sequence[Coordinate]) -> tuple[FloatArray, FloatArray]:
-    """Centre and standard deviation of every coordinate's prior, infinite where none is declared."""
-    centre = np.array(
-        [c.to_u(c.quantity.prior[0]) if c.quantity.prior and c.quantity.linear_power == 1 else 0.0 for c in coords]
-    )
-    width = [PRIOR_WIDTH * c.quantity.prior[1] if c.quantity.prior else np.inf for c in coords]
-    of_u = [
-        w / c.quantity.prior[0] if c.quantity.logarithmic and c.quantity.prior else w**c.quantity.linear_power
-        for w, c in zip(width, coords, strict=True)
-    ]
-    return centre, np.array(of_u)
-
-
 def _wide_residual(t: FloatArray) -> FloatArray:
     """r with -r^2 / 2 the log prior of coordinates t, in widths from its centre: r = t up to |t| = 1, |r| = sqrt(1 + 2
     ln |t|) from there.
@@ -381,7 +306,7 @@ def _wide_slope(t: FloatArray) -> FloatArray:
 
 
 def _standard_deviations(
-    jacobian: FloatArray, coords: Sequence[Coordinate], u: FloatArray, prior_std: FloatArray, effects: int
+    jacobian: FloatArray, coords: Sequence[EffectCoordinate], u: FloatArray, prior_std: FloatArray, effects: int
 ) -> list[dict[str, float | None]]:
     """Of every effect's parameters, from (J'J + P^-1)^-1. With s the standard deviation of u = p^k, that of p is s / (k
     |p|^(k - 1)), and at most s^(1/k), which holds at p = 0. A flat prior between two bounds has their distance over
@@ -405,7 +330,7 @@ def _standard_deviations(
 
 
 def _covariance(
-    jacobian: FloatArray, coords: Sequence[Coordinate], prior_std: FloatArray
+    jacobian: FloatArray, coords: Sequence[EffectCoordinate], prior_std: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """(J'J + P^-1)^-1 of coordinates (p, p), from the whitened Jacobian, and which of them anything bounds (p,). A flat
     prior between two bounds has their distance over sqrt(12)."""
@@ -417,6 +342,33 @@ def _covariance(
     return np.linalg.pinv(curvature / np.outer(size, size)) / np.outer(size, size), told
 
 
+def size_covariance(
+    model: MeasurementModel, effects: Effects, index: int
+) -> tuple[list[EffectCoordinate], FloatArray, FloatArray]:
+    """Return the coordinates that size member `index`, theirs less those of absence (k,), and their posterior
+    covariance (k, k), that of its shapes and of the other members marginalised."""
+    coords = coordinates(effects, model.camera)
+    own = [k for k, c in enumerate(coords) if c.index == index and c.name not in type(effects[index]).shapes]
+    if not own:
+        return [], np.zeros(0), np.zeros((0, 0))
+    u, covariance, told = _posterior_covariance(model, effects, coords)
+    own = [k for k in own if told[k] and coords[k].quantity.absent is not None]
+    absent = np.array([coords[k].to_u(coords[k].absent) for k in own])
+    return [coords[k] for k in own], u[own] - absent, covariance[np.ix_(own, own)]
+
+
+def _posterior_covariance(
+    model: MeasurementModel, effects: Effects, coords: Sequence[EffectCoordinate]
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Coordinates (p,), their posterior covariance (p, p), and which of them anything bounds (p,)."""
+    u = np.array([c.to_u(float(getattr(effects[c.index], c.name))) for c in coords])
+    typical = np.array([c.typical(float(getattr(effects[c.index], c.name))) for c in coords])
+    high = np.array([c.bounds[1] for c in coords])
+    jacobian = _prediction_jacobian(model, effects, coords, u, typical, high)[model.seen]
+    covariance, told = _covariance(model.seen_gaussian(effects).whiten(jacobian), coords, coordinate_prior(coords)[1])
+    return u, covariance, told
+
+
 def displaced(model: MeasurementModel, effects: Effects, index: int) -> list[tuple[Effect, ...]]:
     """Return the effects with member `index` moved by one standard deviation along each principal direction of its
     parameters' posterior, within bounds: a set for each direction. Predictions by these, less that by `effects`, are a
@@ -425,12 +377,9 @@ def displaced(model: MeasurementModel, effects: Effects, index: int) -> list[tup
     own = [k for k, c in enumerate(coords) if c.index == index]
     if not own:
         return []
-    u = np.array([c.to_u(float(getattr(effects[c.index], c.name))) for c in coords])
+    u, covariance, told = _posterior_covariance(model, effects, coords)
     low, high = (np.array(b) for b in zip(*(c.bounds for c in coords), strict=True))
-    typical = np.array([c.typical(float(getattr(effects[c.index], c.name))) for c in coords])
-    jacobian = _prediction_jacobian(model, effects, coords, u, typical, high)[model.seen]
-    covariance, told = _covariance(model.seen_gaussian(effects).whiten(jacobian), coords, coordinate_prior(coords)[1])
-    scale = typical[own]
+    scale = np.array([c.typical(float(getattr(effects[c.index], c.name))) for c in coords])[own]
     size, direction = np.linalg.eigh(covariance[np.ix_(own, own)] / np.outer(scale, scale))
     found = []
     for part in (direction * np.sqrt(np.maximum(size, 0.0))).T:
@@ -465,7 +414,7 @@ def _usual_log_odds(effect: Effect, std: dict[str, float | None]) -> float:
     return max(effect.replace_fields(**dict(zip(std, v, strict=True))).log_prior() for v in product(*near))
 
 
-def _difference_step(coordinate: Coordinate, at: float, typical: float, high: float) -> float:
+def _difference_step(coordinate: EffectCoordinate, at: float, typical: float, high: float) -> float:
     """Step of a one-sided difference at u = `at`, towards the inside of the bounds."""
     step = max(DIFFERENCE_STEP * max(typical, DIFFERENCE_STEP * abs(at)), coordinate.quantity.smooth_over)
     return -step if at + step > high else step
@@ -474,7 +423,7 @@ def _difference_step(coordinate: Coordinate, at: float, typical: float, high: fl
 def _prediction_jacobian(
     model: MeasurementModel,
     effects: Effects,
-    coords: Sequence[Coordinate],
+    coords: Sequence[EffectCoordinate],
     u: FloatArray,
     typical: FloatArray,
     high: FloatArray,

@@ -17,10 +17,10 @@ from lab.diagnose.metadata.misstatement import LEFT_OUT, Misstatement, restated_
 from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.errors import InputError
 from lab.formats.camera_model import camera_model
-from lab.formats.recording_set import Frame, RecordingSet
+from lab.formats.recording_set import FrameCodes, RecordingSet
 from lab.observables.acquisition_errors import ALIKE, alike_planes
 from lab.observables.charts.chart import CHART
-from lab.observables.charts.patches import patch_boxes
+from lab.observables.charts.patches import patch_boxes, patch_codes
 from lab.observables.flats.linearity import PHOTON_TRANSFER
 from lab.observables.noise.levels import darks_near
 from lab.observables.observable import Measurement
@@ -58,7 +58,7 @@ def narrowband_planes(recordings: RecordingSet, side: Side) -> list[LitPlanes]:
         groups.setdefault(capture.wavelength_nm, []).append(capture)
     found = []
     for wavelength_nm, group in groups.items():
-        rates = [_rates(recordings, side, capture, recordings.frame(capture), darks) for capture in group]
+        rates = [_rates(recordings, side, capture, recordings.codes(capture), darks) for capture in group]
         found.append(
             LitPlanes(
                 tuple(c.id for c in group), group[0].kind, group[0].radiance, wavelength_nm, None, np.mean(rates,
@@ -79,15 +79,13 @@ def chart_planes(recordings: RecordingSet, side: Side) -> list[list[LitPlanes]]:
     found = []
     for radiance, unordered in groups.items():
         group = sorted(unordered, key=lambda capture: -capture.exposure_s)
-        frames = [recordings.frame(capture) for capture in group]
         known = reflectances(group[0].chart)
+        codes = [patch_codes(recordings, capture) for capture in group]
         patches = []
         for number, (name, *_) in enumerate(patch_boxes(group[0])):
-            seen = []
-            for capture, frame in zip(group, frames, strict=True):
-                rows, cols = patch_boxes(capture)[number][1:3]
-                even = slice(rows[0] - rows[0] % 2, rows[1]), slice(cols[0] - cols[0] % 2, cols[1])
-                seen.append(_rates(recordings, side, capture, frame[even], darks))
+            seen = [
+                _rates(recordings, side, capture, own[number], darks) for capture, own in zip(group, codes, strict=True)
+            ]
             whole = np.array(seen)
             rate = whole[np.argmax(np.isfinite(whole), axis=0), np.arange(whole.shape[1])]
             offset = OFFSET_DN / group[0].exposure_s
@@ -103,18 +101,16 @@ def _exposed(captures: Sequence[C]) -> list[C]:
 
 
 def _rates(
-    recordings: RecordingSet, side: Side, capture: Capture, part: Frame, darks: Mapping[float, float]
+    recordings: RecordingSet, side: Side, capture: Capture, codes: FrameCodes, darks: Mapping[float, float]
 ) -> FloatArray:
-    """Rates (planes,) in a part of a frame that begins at an even row and column, DN/s above dark."""
+    """Rates (planes,) in a part of a frame, DN/s above dark."""
     camera = recordings.camera(side)
-    step = mosaic.step(camera.cfa)
     nearest = min(darks, key=lambda exposure_s: abs(np.log(max(exposure_s, 1e-9) / capture.exposure_s)))
-    dark = darks[nearest]
-    found = np.full(step**2, np.nan)
-    for k in range(step**2):
-        plane = part[k // step :: step, k % step :: step]
-        if plane.size >= FEWEST_PIXELS and np.mean(plane >= camera.saturation_dn) < CLIPPED_SHARE:
-            found[k] = (float(plane.mean()) - dark) / capture.exposure_s
+    planes = codes.cells if mosaic.step(camera.cfa) == 2 else (codes.every,)
+    found = np.full(len(planes), np.nan)
+    for k, plane in enumerate(planes):
+        if plane.pixels >= FEWEST_PIXELS and plane.share_from(camera.saturation_dn) < CLIPPED_SHARE:
+            found[k] = (plane.mean_dn - darks[nearest]) / capture.exposure_s
     return found
 
 

@@ -3,10 +3,11 @@ covariance."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy import constants
 
 from lab.capture.plan import CapturePlan
 from lab.capture_kinds.base import Equipment
@@ -23,7 +24,6 @@ from lab.formats.recording_set import RecordingSet
 from lab.observables.noise.figures import BLACK_FLOOR_DN
 from lab.observables.noise.repeatability import LAMP_FLOOR
 from lab.observables.spectra.curves import CURVE_ROUGH_STD
-from lab.observables.spectra.narrowband import NARROWBAND_FLOOR
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.optics.imaging import DiffractionLimited
@@ -46,6 +46,9 @@ EDGE_ANGLES_DEG, EDGE_LIGHTS_NM, DIMMEST_CHANNEL = (5.0, 50.0, 95.0, 140.0), (45
 #: Turns of a knife edge by hand (deg) where a station says none; a direction is a new one where it lies so far (deg)
 #: from every other.
 TURNS_DEG, LEAST_TURN_DEG = (45.0, 90.0), 15.0
+#: Wavelengths (nm) between which a light source's light is taken to lie, its colour temperature (K) where none is
+#: stated, the share of its full level at which it is dimmed, and the levels then, shares of `FILLED`.
+LED_LIGHT_NM, USUAL_LIGHT_K, DIMMED, DIMMED_SHARES = (410.0, 680.0), 5000.0, 0.1, (0.05, 0.2, 0.6, 1.0)
 #: By how much (C) sensors are warmed where a station says no temperatures, and exposures (s) of darks at each.
 WARMER_C, WARM_EXPOSURES_S = (10.0, 20.0), (0.01, 1.0, 5.0)
 #: What a station lacks for a capture that no sequence takes.
@@ -61,7 +64,8 @@ class Hypothesis:
 
     `displaced`: the same effects with the rival's parameters one posterior standard deviation away, a set for each
     principal direction of these; `beside`: those that act beside the rival; `law_std`: relative standard deviation of
-    what its law changes.
+    what its law changes. `law_stds`: by the name of an effect, relative standard deviation of what its law changes
+    beside the others.
     """
 
     name: str
@@ -70,6 +74,15 @@ class Hypothesis:
     displaced: tuple[tuple[Effect, ...], ...] = ()
     beside: tuple[Effect, ...] | None = None
     law_std: float = 0.0
+    law_stds: Mapping[str, float] = field(default_factory=dict)
+
+    def without(self) -> Iterator[tuple[tuple[Effect, ...], float]]:
+        """Yield the effects without one whose law may be wrong, and the relative standard deviation of its change."""
+        if self.beside is not None and self.law_std > 0.0:
+            yield self.beside, self.law_std
+        for name, std in self.law_stds.items():
+            if std > 0.0:
+                yield tuple(e for e in self.effects if e.name != name), std
 
 
 @dataclass(frozen=True)
@@ -89,8 +102,8 @@ class CandidateCapture:
         for h, own in zip(rivals, mean, strict=True):
             moved = [self.predict(replace(h, effects=effects)) - own for effects in h.displaced]
             jacobian.append(np.reshape(moved, (len(moved), -1)).T if moved else np.zeros((len(own), 0)))
-            without = None if h.beside is None or h.law_std == 0.0 else self.predict(replace(h, effects=h.beside))
-            law_error.append(np.zeros((len(own), 0)) if without is None else h.law_std * (own - without)[:, None])
+            wrong = [std * (own - self.predict(replace(h, effects=effects))) for effects, std in h.without()]
+            law_error.append(np.reshape(wrong, (len(wrong), -1)).T if wrong else np.zeros((len(own), 0)))
         return Forecast.of(mean, jacobian, law_error, self.covariance)
 
 
@@ -98,12 +111,16 @@ def candidate_captures(
     recordings: RecordingSet, side: Side, model: MeasurementModel, station: Equipment | None = None
 ) -> Iterator[CandidateCapture]:
     """All captures that are considered, in order: narrowband, edges, flats, darks, and those of the session again.
-    `station`: the edges and the f-numbers of the plans are its own; None: those of any station."""
+    `station`: the edges, the f-numbers and the light source's lights of the plans are its own; None: edges and
+    f-numbers of any station, and no light source."""
     camera = model.camera
     lamp = _lamp(recordings, side)
     yield from _narrowband(camera)
     yield from _edges(camera, model, lamp, station)
     yield from _exposure_series(camera, lamp)
+    if station is not None:
+        yield from _colour_temperatures(camera, station)
+        yield from _dimmed(camera, station)
     yield from _steady(camera, lamp)
     yield from _darks(camera, station)
     yield from _again(recordings, side, model)
@@ -148,7 +165,7 @@ def _narrowband(camera: CameraModel) -> Iterator[CandidateCapture]:
 
         signal = predict(Hypothesis("", (), camera))
         noise = (signal + camera.read_noise_e**2) / (PIXELS * REPEATS)
-        floor = np.square(signal) * (NARROWBAND_FLOOR**2 + CURVE_ROUGH_STD**2)
+        floor = np.square(CURVE_ROUGH_STD * signal)
         around = {"from_nm": float(centre - 5.0), "to_nm": float(centre + 5.0), "step_nm": 2.5}
         yield CandidateCapture(
             f"narrowband light at {centre:g} nm",
@@ -305,6 +322,89 @@ def _exposure_series(camera: CameraModel, lamp: Spectrum) -> Iterator[CandidateC
         by_exposure = all(light is lamp for light, _ in steps)
         sequence = FlatSequence(levels=tuple((FILLED * shares).round(3).tolist()), frames=2 * REPEATS)
         yield CandidateCapture(words, predict, covariance, CapturePlan((sequence,)) if by_exposure else None)
+
+
+def _colour_temperatures(camera: CameraModel, station: Equipment) -> Iterator[CandidateCapture]:
+    """Flats in the light source's light of each colour temperature that the station states. Their spectra will be
+    measured; till then they are a black body's between `LED_LIGHT_NM`. The level is a nuisance parameter, so that the
+    ratios of the channels tell."""
+    if len(camera.channels) < 2:
+        return
+    for kelvin in _colour_temperatures_k(station):
+        light = _black_body(kelvin)
+        exposure = _filling_exposure_s(camera, light)
+        if exposure <= 0:
+            continue
+
+        def predict(h: Hypothesis, light: Spectrum = light, exposure: float = exposure) -> FloatArray:
+            return np.array(list(_means(h, light, "flat", exposure).values()))
+
+        mean = predict(Hypothesis("", (), camera))
+        noise = (mean + camera.read_noise_e**2) / (PIXELS * REPEATS)
+        floor = np.square(CURVE_ROUGH_STD * mean)
+        black = (BLACK_FLOOR_DN / camera.conversion_gain_dn_per_e) ** 2
+        flats = FlatSequence(levels=(FILLED,), frames=REPEATS, lamp_level=1.0, colour_temperature_k=kelvin)
+        yield CandidateCapture(
+            f"flats in the light source's light of {kelvin:g} K",
+            predict,
+            np.diag(noise + floor + black) + NUISANCE_STD**2 * np.outer(mean, mean),
+            CapturePlan((flats,)),
+        )
+
+
+def _colour_temperatures_k(station: Equipment) -> list[float]:
+    """Return the colour temperatures (K) of a station's lights, ascending."""
+    return sorted({one.colour_temperature_k for one in station.lights.values() if one.colour_temperature_k is not None})
+
+
+def _black_body(kelvin: float) -> Spectrum:
+    """Return the light of a black body (W sr^-1 m^-2 nm^-1, scaled to 0.01 at 560 nm) between `LED_LIGHT_NM`."""
+    wavelength_nm = np.arange(LED_LIGHT_NM[0], LED_LIGHT_NM[1] + 1.0, 10.0)
+    x, at_560 = (constants.h * constants.c / (nm * 1e-9 * constants.k * kelvin) for nm in (wavelength_nm, 560.0))
+    value = 0.01 * (560.0 / wavelength_nm) ** 5 * np.expm1(at_560) / np.expm1(x)
+    return Spectrum.of(wavelength_nm, value)
+
+
+def _dimmed(camera: CameraModel, station: Equipment) -> Iterator[CandidateCapture]:
+    """Flats at the light source's full level and at `DIMMED` of it, exposed longer by as much: what follows the
+    exposure differs between the two, what follows the signal doesn't. Nuisance parameters: the light at each level,
+    and the black level."""
+    if not station.lights:
+        return
+    kelvin = next(iter(station.lights.values())).colour_temperature_k
+    light = _black_body(kelvin or USUAL_LIGHT_K)
+    full = _filling_exposure_s(camera, light)
+    if full <= 0:
+        return
+    wavelength_nm, value = light.arrays
+    lights = {1.0: light, DIMMED: Spectrum.of(wavelength_nm, DIMMED * value)}
+    steps = [(level, one, share * full / level) for level, one in lights.items() for share in DIMMED_SHARES]
+
+    def predict(h: Hypothesis) -> FloatArray:
+        return np.array([list(_means(h, one, "flat", seconds).values()) for _, one, seconds in steps]).ravel()
+
+    mean = predict(Hypothesis("", (), camera))
+    noise = (mean + camera.read_noise_e**2) / (PIXELS * REPEATS)
+    level = np.repeat([level for level, *_ in steps], len(camera.channels))
+    channel = np.tile(np.arange(len(camera.channels)), len(steps))
+    free = [np.where((level == at) & (channel == c), mean, 0.0) for at in lights for c in range(len(camera.channels))]
+    free.append(np.ones_like(mean))
+    flats = [
+        FlatSequence(
+            levels=tuple((FILLED * np.array(DIMMED_SHARES)).round(3).tolist()),
+            frames=REPEATS,
+            lamp_level=at,
+            colour_temperature_k=kelvin,
+        )
+        for at in lights
+    ]
+    yield CandidateCapture(
+        f"flats at the light source's full level and at {100.0 * DIMMED:g} % of it, exposed {1.0 / DIMMED:g} times as "
+        "long",
+        predict,
+        np.diag(noise + np.square(2.0 * LAMP_FLOOR * mean)) + NUISANCE_STD**2 * sum(np.outer(c, c) for c in free),
+        CapturePlan(tuple(flats)),
+    )
 
 
 def _steady(camera: CameraModel, lamp: Spectrum) -> Iterator[CandidateCapture]:

@@ -66,16 +66,45 @@ def expected_information(forecasts: Sequence[Forecast], odds: Sequence[float]) -
     """Return the information (nat) that captures taken together give about which rival acts. `odds`: probabilities of
     the rivals, which sum to 1."""
     p = np.asarray(odds, float)
-    mean = np.concatenate([f.mean for f in forecasts], axis=1)
-    variance = []
-    for k in range(len(p)):
-        by_parameters = np.concatenate([f.jacobian[k] for f in forecasts])
-        by_law = block_diag(*(f.law_error[k] for f in forecasts))
-        variance.append(np.eye(mean.shape[1]) + by_parameters @ by_parameters.T + by_law @ by_law.T)
+    mean, variance = _together(forecasts, len(p))
     near = np.eye(len(p))
     for k, l in combinations(range(len(p)), 2):  # noqa: E741
         near[k, l] = near[l, k] = np.exp(-_bhattacharyya(mean[k] - mean[l], variance[k], variance[l]))
     return float(max(-np.sum(p * np.log(near @ p)), 0.0))
+
+
+#: Draws a rival behind the probability that captures settle a doubt.
+DRAWS = 400
+
+
+def settling_probability(forecasts: Sequence[Forecast], odds: Sequence[float], threshold: float) -> float:
+    """Return the probability that one rival holds `threshold` of the probability after captures that are taken
+    together. Each rival's numbers are drawn from its forecast; the standard error is at most 0.5 / sqrt(`DRAWS`)."""
+    p = np.asarray(odds, float)
+    mean, variance = _together(forecasts, len(p))
+    lower = [cholesky(v, lower=True) for v in variance]
+    noise = np.random.default_rng(0).standard_normal((mean.shape[1], DRAWS))
+    settled = 0.0
+    for k in range(len(p)):
+        numbers = mean[k][:, None] + lower[k] @ noise
+        log = np.empty((len(p), DRAWS))
+        for l in range(len(p)):  # noqa: E741
+            white = solve_triangular(lower[l], numbers - mean[l][:, None], lower=True)
+            log[l] = np.log(p[l]) - 0.5 * np.square(white).sum(axis=0) - np.log(np.diag(lower[l])).sum()
+        weight = np.exp(log - log.max(axis=0))
+        settled += float(p[k] * np.mean((weight / weight.sum(axis=0)).max(axis=0) >= threshold))
+    return settled
+
+
+def _together(forecasts: Sequence[Forecast], rivals: int) -> tuple[FloatArray, list[FloatArray]]:
+    """Return mean (k, n) and covariances (n, n) of captures that are taken together, for each of k rivals."""
+    mean = np.concatenate([f.mean for f in forecasts], axis=1)
+    variance = []
+    for k in range(rivals):
+        by_parameters = np.concatenate([f.jacobian[k] for f in forecasts])
+        by_law = block_diag(*(f.law_error[k] for f in forecasts))
+        variance.append(np.eye(mean.shape[1]) + by_parameters @ by_parameters.T + by_law @ by_law.T)
+    return mean, variance
 
 
 def _bhattacharyya(apart: FloatArray, one: FloatArray, other: FloatArray) -> float:

@@ -6,13 +6,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
-from scipy import optimize, special
+from scipy import special
 
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.held_out import held_out_residual
 from lab.diagnose.inference.locate import chi2_by_slice
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.search import ModelSet
+from lab.diagnose.outcome.detectability import detectable, smallest_sizes, told_as
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import (
     EffectSet,
@@ -31,18 +32,7 @@ from sim.camera import Side
 from sim.effects.base import Effect, Effects
 from sim.effects.library import candidates, list_changes
 from sim.effects.library import effects as library
-from sim.parameters import Quantity
 from sim.spectrum import FloatArray
-
-
-def told_as(field: str, quantity: Quantity, *, gain_is_known: bool) -> tuple[str, str]:
-    """Name and unit of an effect's parameter in a result. Without a known gain the baseline has 1 DN/e, so that its
-    electrons are DN."""
-    if gain_is_known or quantity.unit not in ("e", "e/s"):
-        return field, quantity.unit
-    stem, _, more = field.rpartition("_e")
-    return f"{stem}_dn{more}", quantity.unit.replace("e", "DN")
-
 
 # --- Goodness of fit of each slice and each measurement, with the baseline and with what was found --------------------
 
@@ -167,13 +157,6 @@ def residual_curves(side: Side, verdict: Verdict) -> Iterator[ResidualCurve]:
 # --- The smallest detectable size of each effect in these recordings, and the effect that is most like it -------------
 
 
-def detectable(threshold: float, probability: float = DecisionPolicy().detection_probability) -> float:
-    """Return the non-centrality lambda with P(chi2_1(lambda) > threshold) = probability."""
-    return float(
-        optimize.brentq(lambda x: 1.0 - special.chndtr(threshold, 1, x) - probability, 1e-6, 10.0 * threshold + 100.0)
-    )
-
-
 def detectability(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Iterator[Visibility]:
     """For every effect that acts on what was recorded: the smallest detectable size of each parameter, and the nearest
     effect.
@@ -201,33 +184,12 @@ def detectability(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Itera
             effect=name,
             smallest={
                 told_as(field, library()[name].quantities()[field], gain_is_known=model.gain_is_known)[0]: size
-                for field, size in _smallest(library()[name], members, needed).items()
+                for field, size in smallest_sizes(library()[name], members, needed).items()
             },
             nearest=nearest,
             cosine=cosine,
             told_apart=float(special.ndtr(0.5 * np.sqrt(needed * (1.0 - cosine**2)))),
         )
-
-
-def _smallest(
-    effect: type[Effect], members: list[tuple[tuple[Effect, ...], FloatArray]], needed: float
-) -> dict[str, float]:
-    """Parameter -> least departure from `absent` at which the non-centrality is `needed`. Empty for effects with
-    prototypes of shape, whose signature isn't a power of the size."""
-    found: dict[str, float] = {}
-    if effect.shapes:
-        return found
-    for prototypes, table in members:
-        for prototype, column in zip(prototypes, table.T, strict=True):
-            size = float(np.linalg.norm(column))
-            moved = {f: q for f, q in effect.quantities().items() if getattr(prototype, f) != (q.absent or 0.0)}
-            if size <= 0 or len(moved) != 1:
-                continue
-            ((field, quantity),) = moved.items()
-            away = abs(float(getattr(prototype, field)) - (quantity.absent or 0.0))
-            least = away * (np.sqrt(needed) / size) ** (1.0 / quantity.linear_power)
-            found[field] = min(found.get(field, np.inf), float(least))
-    return {field: value for field, value in found.items() if np.isfinite(value)}
 
 
 # --- The credible sets of effects that the search found, as a result and in sentences ---------------------------------

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 from scipy import special
 
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.outcome.goodness_of_fit import set_sentences, told_as
+from lab.diagnose.outcome.detectability import told_as
+from lab.diagnose.outcome.determined import is_determined
+from lab.diagnose.outcome.goodness_of_fit import set_sentences
+from lab.diagnose.outcome.named_in_words import (
+    LEAST_CAPTURES,
+    choices_of,
+    combination_in_words,
+    family_statement,
+    plain_name,
+    pooled,
+)
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
-from lab.effect_titles import effect_title
 from lab.formats.results import (
     DiagnosisLists,
     DiagnosisResult,
@@ -26,17 +34,7 @@ from lab.formats.results import (
 from lab.formats.results.words import measured
 from lab.observables.observable import measurement_title
 from sim.camera import Side
-from sim.effects.base import Effect
-from sim.effects.families import Family
 from sim.effects.library import effects as library
-
-#: Members of a named family that its sentence lists.
-TOLD_MEMBERS = 4
-#: What to capture where no measurement is determined.
-LEAST_CAPTURES = (
-    "Add dark frames at two exposures, and flat frames at three levels or more with the light's radiance: the "
-    "measurements begin with these."
-)
 
 
 def merged(
@@ -102,25 +100,30 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
             if quantity.dispensable and all(c.std.get(field) is None for c in candidates):
                 continue
             values_of_sides = [(float(getattr(c.effect, field)), c.std.get(field)) for c in candidates]
-            value, std = _mean(values_of_sides, is_shared="light" in kind.stages())
+            value, std = pooled(values_of_sides, is_shared="light" in kind.stages())
             told, unit = told_as(field, quantity, gain_is_known=bool(in_electrons))
             is_signed = all(field not in c.unsigned for c in candidates)
             interval = _interval(field, candidates)
+            is_size = quantity.absent is not None and field not in kind.shapes
             parameters[told] = ParameterValue(
-                value=value, std=None if interval else std, unit=unit, sign_known=is_signed, interval=interval
+                value=value,
+                std=None if interval else std,
+                unit=unit,
+                sign_known=is_signed,
+                interval=interval,
+                is_determined=not is_size or is_determined(value, quantity.absent or 0.0, std, interval),
             )
-        chosen = [_choices(c.effect, c.alike) for c in candidates]
+        chosen = [choices_of(c.effect, c.alike) for c in candidates]
         choices = {
             field: " and ".join(dict.fromkeys(one[field] for one in chosen if field in one)) for field in chosen[0]
         }
+        combined = tuple(c for _, one in members if one.candidate in candidates for c in one.combinations)
         shown_in = tuple(dict.fromkeys(measurement for _, one in members for measurement in one.shown_in))
         shown = sorted({measurement_title(measurement) for measurement in shown_in})
         values = ", ".join(
             (
-                *(
-                    f"{_plain_name(f, p.unit)} {measured(p.value, p.std, p.unit, p.interval)}"
-                    for f, p in parameters.items()
-                ),
+                *(_size(f, p) for f, p in parameters.items()),
+                *(combination_in_words(c) for c in combined),
                 *(f"{f} {value}".replace("_", " ") for f, value in choices.items()),
             )
         )
@@ -128,14 +131,14 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
             values += "; sign unknown"
         modes = candidates[0].modes if len(candidates) == 1 else ()
         for mode in modes:
-            told = ", ".join(f"{_plain_name(f, parameters[f].unit)} {v:.3g}" for f, v in mode.items())
+            told = ", ".join(f"{plain_name(f, parameters[f].unit)} {v:.3g}" for f, v in mode.items())
             values += f"; {told} fits as well"
         sides = tuple(side for side, _ in members)
         is_exact = all(one.candidate.is_closed for _, one in members)
         corrections = tuple(dict.fromkeys(c for _, one in members for c in one.corrections))
         seen = f"Seen in {' and '.join(shown)} of the {' and '.join(sides)} camera"
         if held:
-            statement = _family_statement(kind.family, held, is_exact, seen, values, corrections)
+            statement = family_statement(kind.family, held, is_exact, seen, values, corrections)
         else:
             statement = f"{kind.sentence} {seen}: {values}."
         named.append(
@@ -147,6 +150,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
                 probability=min(one.candidate.probability for _, one in members),
                 sides=sides,
                 parameters=parameters,
+                combinations=combined,
                 choices=choices,
                 modes=modes,
                 shown_in=shown_in,
@@ -159,16 +163,6 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
     return named
 
 
-def _choices(effect: Effect, alike: Sequence[Effect] = ()) -> dict[str, str]:
-    """Return which of its alternatives an effect is, by field; and those that the recordings don't tell from it."""
-    told: dict[str, str] = {}
-    for name in type(effect).told_choices():
-        values = dict.fromkeys(getattr(one, name) for one in (effect, *alike))
-        if getattr(effect, name) is not None:
-            told[name] = " or ".join(str(value) for value in values if value is not None)
-    return told
-
-
 def _members(candidates: Sequence[Candidate]) -> tuple[Member, ...]:
     """Return the effects of a named family over all sides, by their mean probability, likeliest first."""
     total: dict[str, float] = {}
@@ -178,31 +172,10 @@ def _members(candidates: Sequence[Candidate]) -> tuple[Member, ...]:
     return tuple(Member(name=n, probability=p) for n, p in sorted(total.items(), key=lambda item: -item[1]))
 
 
-def _family_statement(
-    family: Family, members: Sequence[Member], is_exact: bool, seen: str, values: str, corrections: Sequence[str]
-) -> str:
-    """Return the sentences about a named family: how well its laws hold, which they are, and the capture that tells
-    them apart."""
-    names = [f"{effect_title(m.name)} ({100 * m.probability:.0f} %)" for m in members[:TOLD_MEMBERS]]
-    told = [family.sentence, f"{seen}."]
-    if is_exact:
-        told.append(f"The recordings can't tell {' from '.join(names)}; by the first: {values}.")
-    else:
-        told.append(
-            f"No listed law of {family.words} fits exactly; the nearest is {effect_title(members[0].name)}: {values}."
-        )
-        if len(names) > 1:
-            told.append(f"Of the listed laws: {', '.join(names)}.")
-        if corrections:
-            told.append(f"What it leaves is in the improved model: {'; '.join(corrections)}.")
-    if len(names) > 1 and family.separating_capture:
-        told.append(f"What tells them apart: {family.separating_capture}.")
-    return " ".join(told)
-
-
-def _plain_name(field: str, unit: str) -> str:
-    """Return a parameter's name in words, without its unit."""
-    return field.removesuffix("_" + unit.lower()).replace("_", " ")
+def _size(field: str, value: ParameterValue) -> str:
+    """Return a parameter in words, with what its interval tells."""
+    text = f"{plain_name(field, value.unit)} {measured(value.value, value.std, value.unit, value.interval)}"
+    return text if value.is_determined else f"{text}, not determined"
 
 
 def _interval(field: str, candidates: Sequence[Candidate]) -> tuple[float, float] | None:
@@ -214,22 +187,6 @@ def _interval(field: str, candidates: Sequence[Candidate]) -> tuple[float, float
         value, std = float(getattr(c.effect, field)), c.std.get(field)
         ends.append(c.intervals.get(field) or (value - 2.0 * (std or 0.0), value + 2.0 * (std or 0.0)))
     return min(low for low, _ in ends), max(high for _, high in ends)
-
-
-def _mean(values: list[tuple[float, float | None]], is_shared: bool) -> tuple[float, float | None]:
-    """Mean of (value, standard deviation), weighted by 1 / variance; the first value where a standard deviation isn't
-    known.
-
-    `is_shared`: the values hold the same light, read by the same radiometer, so that their errors are taken as fully
-    correlated: the mean's standard deviation is the weighted mean of theirs, the largest that any correlation allows.
-    Else they are independent."""
-    known = [(v, s) for v, s in values if s]
-    if len(known) != len(values) or len(values) == 1:
-        return values[0]
-    weight = np.array([1.0 / s**2 for _, s in known])
-    std = np.array([s for _, s in known])
-    mean = float(np.sum(weight * np.array([v for v, _ in known])) / weight.sum())
-    return mean, float(np.sum(weight * std) / weight.sum() if is_shared else 1.0 / np.sqrt(weight.sum()))
 
 
 def _held_out(found: Sequence[SideFindings]) -> HeldOut | None:

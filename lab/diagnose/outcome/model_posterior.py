@@ -14,12 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.refit import Coordinate, coordinate_prior, coordinates, moved, refit
-from lab.diagnose.inference.score import signatures
-from lab.diagnose.policy import DecisionPolicy
-from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior, NameInDoubt, RivalModel, StoredEffect
+from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior
+from lab.inference.coordinates import EffectCoordinate, coordinate_prior, coordinates, moved
 from lab.observables.charts.chart import CHART
 from lab.observables.charts.patches import reflectance_covariance
 from lab.observables.flats.noise import GAIN_STD, NOISE
@@ -51,10 +48,12 @@ def model_posterior(
     discrepancies: Mapping[int, FloatArray] | None = None,
     gain_db: float = 0.0,
     is_corrected: bool = False,
+    disturbances: FloatArray | None = None,
 ) -> ModelPosterior | None:
     """Return the posterior of the parameters of `model` with `effects`, about `camera`, the improved model.
 
     discrepancies : covariances of model discrepancies by block, which stand beside the effects
+    disturbances : columns (n, r) of small physics, of unit variance, which are marginalised
     is_corrected : whether the improved model has a correction of the noise, which holds what gain and read noise were
     moved by gain_db : amplification for which the estimates of `model` hold
 
@@ -93,7 +92,8 @@ def model_posterior(
         for index, kernel in kernels.items():
             inside = seen[model.slices[index]]
             gaussian = gaussian.with_discrepancy(index, kernel[np.ix_(inside, inside)])
-        with_effects = np.column_stack([gaussian.shared_jacobian, by_effects * width])
+        small = np.zeros((int(seen.sum()), 0)) if disturbances is None else disturbances[seen]
+        with_effects = np.column_stack([gaussian.shared_jacobian, small, by_effects * width])
         gaussian = replace(gaussian, shared_jacobian=with_effects)
         white = gaussian.whiten(np.column_stack([jacobian, model.seen_value - gaussian.mean]))
         return white[:, :-1].T @ white[:, -1], prior - white[:, :-1].T @ white[:, :-1]
@@ -118,7 +118,11 @@ def lasting_means(
     model: MeasurementModel, effects: Sequence[Effect], discrepancies: Mapping[int, FloatArray]
 ) -> dict[str, float]:
     """Posterior means of the nuisance parameters that stay, and of the patches' reflectances, with other effects."""
-    weighted = model.weighted_residual(effects, discrepancies)
+    return lasting_means_of(model, effects, model.weighted_residual(effects, discrepancies))
+
+
+def lasting_means_of(model: MeasurementModel, effects: Sequence[Effect], weighted: FloatArray) -> dict[str, float]:
+    """Return the same, given the weighted residual C^-1 (y - m), (n,)."""
     found = {
         name: float(column @ weighted)
         for name, column in model.nuisance_jacobian(effects).items()
@@ -158,12 +162,14 @@ def with_unnamed(effects: Sequence[Effect], posterior: ModelPosterior) -> tuple[
     return (*effects, *(library()[name]() for name in more if name in library() and name not in there))
 
 
-def coordinate_name(effects: Sequence[Effect], coordinate: Coordinate) -> str:
+def coordinate_name(effects: Sequence[Effect], coordinate: EffectCoordinate) -> str:
     """Return how a posterior calls the parameter of an effect."""
     return f"{effects[coordinate.index].name}.{coordinate.name}"
 
 
-def effect_jacobian(model: MeasurementModel, effects: Sequence[Effect], coords: Sequence[Coordinate]) -> FloatArray:
+def effect_jacobian(
+    model: MeasurementModel, effects: Sequence[Effect], coords: Sequence[EffectCoordinate]
+) -> FloatArray:
     """Derivatives (n, p) of the predicted numbers by the coordinates of the effects' parameters, by differences within
     the bounds."""
     columns = [np.zeros((len(model.value), 0))]
@@ -192,41 +198,3 @@ def _patches(model: MeasurementModel) -> tuple[tuple[str, ...], FloatArray, Floa
             signal = block.scale[rows]
             return tuple(first), jacobian, reflectance_covariance(names, channel, signal) / np.outer(signal, signal)
     return (), np.zeros((len(model.value), 0)), np.zeros((0, 0))
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Every name with its rivals, each fitted in its place, so that a capture of another configuration can tell them apart.
-
-
-def names_in_doubt(verdict: Verdict, policy: DecisionPolicy) -> tuple[NameInDoubt, ...]:
-    """Every named effect or family, what the camera is without it, and what it is with each of its rivals."""
-    model = verdict.model
-    named = lasting_means(model, verdict.effects, verdict.kernels)
-
-    def rival(name: str, probability: float, acting: tuple[Effect, ...]) -> RivalModel:
-        means = lasting_means(model, acting, verdict.kernels)
-        shift = {key: means.get(key, 0.0) - value for key, value in named.items()}
-        return RivalModel(
-            name=name, probability=probability, effects=tuple(map(StoredEffect.of, acting)),
-            shift={key: float(f"{value:.6g}") for key, value in shift.items()},
-        )  # fmt: skip
-
-    found = []
-    for candidate in verdict.named:
-        beside = tuple(e for e in verdict.effects if e.name != candidate.effect.name)
-        without = refit(model, beside, policy, passes=2).effects if beside else ()
-        rivals = [rival("", 0.0, without)]
-        likely = [(n, p) for n, p in candidate.alternatives if n in library() and p >= policy.least_rival_probability]
-        for name, probability in likely[: policy.next_capture_rivals]:
-            scores = signatures(model, model.camera, beside, [library()[name]]).scores()
-            if scores and name not in {e.name for e in beside}:
-                fit = refit(model, (*beside, scores[0].start), policy, passes=2)
-                rivals.append(rival(name, probability, fit.effects))
-        own = dict(candidate.members).get(candidate.effect.name, candidate.probability)
-        found.append(
-            NameInDoubt(
-                effect=candidate.effect.name, told=candidate.told_name, probability=own,
-                named=tuple(e.name for e in verdict.effects), rivals=tuple(rivals),
-            )
-        )  # fmt: skip
-    return tuple(found)

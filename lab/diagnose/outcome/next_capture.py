@@ -19,21 +19,12 @@ import numpy as np
 from scipy.special import ndtr
 
 from lab.capture.plan import CapturePlan
-from lab.capture_kinds.base import Equipment
-from lab.diagnose.inference.decide import Verdict
-from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.refit import displaced, refit
-from lab.diagnose.inference.score import signatures
-from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
-from lab.diagnose.outcome.expected_information import Forecast
+from lab.diagnose.outcome.expected_information import Forecast, settling_probability
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.visibility import visibility
-from lab.formats.recording_set import RecordingSet
 from lab.formats.results import NextCapture
-from lab.observables.spectra.curves import freed_curve
+from lab.inference.posterior import NAMED
 from sim.camera import Side
-from sim.effects.base import Effect
 from sim.effects.library import effects as library
 
 #: What to vary where no predicted capture tells two effects apart, but one depends on a condition and the other
@@ -51,6 +42,14 @@ SETTLING: dict[str, tuple[str, str | None]] = {
     "field": ("the same captures at the corners of the field", LIT),
     "time": ("the same captures again, in the reverse order", None),
 }
+
+
+#: Between the effects of a rival that is a set of them, and the name of one without any.
+WITH, NOTHING = " with ", "none"
+
+
+#: A rival without an effect, in a sentence.
+NO_EFFECT = "no further effect"
 
 
 @dataclass(frozen=True)
@@ -88,74 +87,13 @@ class Doubt:
                     rivals=(self.rivals[one], self.rivals[other]),
                     distance=distance,
                     told_apart=float(ndtr(np.sqrt(0.5 * distance))),
+                    settles=round(settling_probability([capture.forecast], self.odds, NAMED), 3),
                 )
             )
         found.sort(key=lambda item: -item.distance)
         # a capture that neither rival changes tells nothing: an f-number for darks
         found = [item for item in found if item.distance >= policy.next_capture_least_distance] or found[:1]
         return tuple(found[: policy.next_captures_listed])
-
-
-def doubt_of(
-    recordings: RecordingSet, side: Side, verdict: Verdict, policy: DecisionPolicy, station: Equipment | None = None
-) -> Doubt | None:
-    """Return what a verdict leaves in doubt, and the captures that could be taken, by the sequences of `station`; None
-    where no rivals are left."""
-    rivals = _rivals(verdict, policy)
-    if len(rivals) < 2:
-        return None
-    total = sum(p for p, _ in rivals)
-    hypotheses = [h for _, h in rivals]
-    captures = [
-        OpenCapture(candidate.words, candidate.forecast(hypotheses), candidate.plan, candidate.needs)
-        for candidate in candidate_captures(recordings, side, verdict.model, station)
-    ]
-    return Doubt(side, tuple(h.name for h in hypotheses), tuple(p / total for p, _ in rivals), tuple(captures))
-
-
-def _rivals(verdict: Verdict, policy: DecisionPolicy) -> list[tuple[float, Hypothesis]]:
-    """Return the effect whose rivals are likeliest, and these rivals, each fitted in its place: as many as together
-    hold `next_capture_share`; with their probabilities."""
-    model, least = verdict.model, policy.least_rival_probability
-
-    def rival_probability(candidate: Candidate) -> float:
-        return sum(p for name, p in candidate.alternatives if name in library() and p >= least)
-
-    candidates = [c for c in (*verdict.named, *verdict.abstained) if rival_probability(c) > 0]
-    if not candidates:
-        return []
-    chosen = max(candidates, key=rival_probability)
-    beside = tuple(e for e in verdict.effects if e.name != chosen.effect.name)
-    own = dict(chosen.members).get(chosen.effect.name, chosen.probability)
-    found = [(own, _hypothesis(model, (*beside, chosen.effect)))]
-    held = [
-        (own, chosen.effect.name),
-        *((p, name) for name, p in chosen.alternatives if name in library()),
-    ]
-    before = np.cumsum([0.0, *(p for p, _ in held)]) / sum(p for p, _ in held)
-    for (p, name), reached in list(zip(held, before, strict=False))[1 : policy.next_capture_rivals]:
-        if p < least or (reached > policy.next_capture_share and len(found) > 1):
-            break
-        scores = signatures(model, model.camera, beside, [library()[name]]).scores()
-        if scores:
-            fit = refit(model, (*beside, scores[0].start), policy, passes=2)
-            found.append((p, _hypothesis(model, fit.effects)))
-    return found
-
-
-def _hypothesis(model: MeasurementModel, effects: tuple[Effect, ...]) -> Hypothesis:
-    """Return the rival that is the last of `effects`, beside the others."""
-    estimates = model.nuisance_estimates(effects)
-    curves = {c: freed_curve(q, c, estimates) for c, q in model.camera.quantum_efficiency.items()}
-    camera = model.camera.model_copy(update={"quantum_efficiency": curves})
-    return Hypothesis(
-        effects[-1].name,
-        (*model.always, *effects),
-        camera,
-        tuple((*model.always, *moved) for moved in displaced(model, effects, len(effects) - 1)),
-        (*model.always, *effects[:-1]),
-        effects[-1].form_tolerance,
-    )
 
 
 def next_sentence(found: Sequence[NextCapture], settling: str | None, policy: DecisionPolicy) -> str | None:
@@ -165,26 +103,29 @@ def next_sentence(found: Sequence[NextCapture], settling: str | None, policy: De
         return settling
     best = max(found, key=lambda one: one.distance)
     one, other = best.rivals
+    told, told_other = (NO_EFFECT if n == NOTHING else n for n in sorted(best.rivals, key=lambda n: n == NOTHING))
+    sigma = f"{np.sqrt(2.0 * best.distance):.1f}"
     if best.distance >= policy.next_capture_distance:
         return (
-            f"{best.capture[0].upper()}{best.capture[1:]} would tell {one} from {other}: their predictions lie "
-            f"{np.sqrt(2.0 * best.distance):.1f} "
-            f"standard deviations apart there, which decides rightly in {100 * min(best.told_apart, 0.999):.3g} % of "
-            "all cases."
+            f"{best.capture[0].upper()}{best.capture[1:]} would tell {told} from {told_other}: their predictions lie "
+            f"{sigma} standard deviations apart there, which decides rightly in "
+            f"{100 * min(best.told_apart, 0.999):.3g} % of all cases."
         )
-    beyond = (
-        f"no capture that can be predicted tells {one} from {other} by more than {np.sqrt(2.0 * best.distance):.1f} "
-        "standard deviations"
-    )
-    differs = library()[one].invariances ^ library()[other].invariances
+    beyond = f"no capture that can be predicted tells {told} from {told_other} by more than {sigma} standard deviations"
+    steady_by = {name: _invariances(name) for name in (one, other)}
     for thing, (capture, kind) in SETTLING.items():
-        if thing in differs:
-            steady, moving = (one, other) if thing in library()[one].invariances else (other, one)
-            if _shows_in(moving, kind):
-                return (
-                    f"{capture[0].upper()}{capture[1:]} may tell them apart ({beyond}): only {steady} stays the same."
-                )
+        if thing in steady_by[one] ^ steady_by[other]:
+            steady, moving = (one, other) if thing in steady_by[one] else (other, one)
+            if any(_shows_in(effect, kind) for effect in moving.split(WITH)):
+                why = f"{moving} changes" if steady == NOTHING else f"only {steady} stays the same"
+                return f"{capture[0].upper()}{capture[1:]} may tell them apart ({beyond}): {why}."
     return f"{beyond[0].upper()}{beyond[1:]}: both depend on the same things."
+
+
+def _invariances(rival: str) -> frozenset[str]:
+    """Return what none of a rival's effects depends on; of a rival without effects, everything."""
+    kinds = [library()[name] for name in rival.split(WITH) if name in library()]
+    return frozenset(SETTLING).intersection(*(kind.invariances for kind in kinds))
 
 
 def _shows_in(effect: str, kind: str | None) -> bool:

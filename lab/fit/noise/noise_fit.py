@@ -296,7 +296,7 @@ def photon_transfer_points(e: Evaluation, deviation: dict[tuple[int, str], float
                 f + e.transfer.gain * (e.dark.mean_dn(n, level.exposure_s) - e.dark.lines[n].black)
                 for f, n in zip(floor, own, strict=True)
             ]
-            variance = [p.temporal_variance - d for p, d in zip(planes, dark, strict=True)]
+            variance = [e.levels.pixel_variance_dn2(level, n) - d for n, d in zip(own, dark, strict=True)]
             shares = [deviation[id(level), n] for n in own if (id(level), n) in deviation]
             rows.append(
                 (
@@ -342,7 +342,8 @@ def remark_on_planes(e: Evaluation) -> None:
         if not own or e.transfer.by_line:
             continue
         signal = np.array([p.mean - e.dark.lines[name].black for p, _ in own])
-        excess = np.array([p.temporal_variance for p, _ in own]) - e.transfer.floor[e.plane_index[name]]
+        variance = np.array([e.levels.pixel_variance_dn2(level, name) for _, level in own])
+        excess = variance - e.transfer.floor[e.plane_index[name]]
         excess -= e.transfer.curvature * signal**2
         weight = (signal / np.hypot([p.temporal_variance_std for p, _ in own], e.transfer.model_error * excess)) ** 2
         values.append(float(np.sum(weight * excess / signal) / weight.sum()))

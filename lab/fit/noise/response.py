@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lab.fit.noise.evaluation import CURVE_LIMIT, LINE_LIMIT, Evaluation, in_electrons
+from lab.fit.noise.evaluation import Evaluation, in_electrons
+from lab.fit.noise.transfer import CURVE_LIMIT, LINE_LIMIT
 from lab.observables.noise.levels import MeasuredLevel
 from lab.observables.weighted_lines import Linearity, chi2_factor, least_squares, linearity
 from sim.spectrum import FloatArray

@@ -10,12 +10,12 @@ from scipy import linalg, optimize, special
 from lab.fit.spectral.curve_prior import LowerBounds, smooth_root, straight_lines, within_bounds
 from lab.fit.spectral.sensitivity import (
     COVERAGE_FACTOR,
-    RADIOMETER_RELATIVE_STD,
     ChannelSignals,
     Sensitivity,
     light_errors,
 )
 from lab.formats.results import MakerDeparture
+from lab.observables.spectra.light_readings import RADIOMETER_STD
 from sim.spectrum import FloatArray
 
 COMMON_LINE_STD = 0.3  # of the factor common to the channels: a constant and a slope
@@ -101,9 +101,7 @@ def solve_with_maker(
                 np.sqrt(np.clip(np.diag(covariance), 0.0, None)),
                 COVERAGE_FACTOR,
                 covariance,
-                RADIOMETER_RELATIVE_STD
-                * (linalg.cho_solve(factor, cross.T).T[:, at] / signals[c].std)
-                @ errors[str(c)],
+                RADIOMETER_STD * (linalg.cho_solve(factor, cross.T).T[:, at] / signals[c].std) @ errors[str(c)],
             )
         )
     return result

@@ -37,7 +37,6 @@ from lab.fit.spectral.sensitivity import (
     COVERAGE_FACTOR,
     MIN_SPECTRA,
     NEGATIVE_LIGHT,
-    RADIOMETER_RELATIVE_STD,
     ROUGHNESS_FLOORS,
     ChannelSignals,
     Scatter,
@@ -54,6 +53,7 @@ from lab.formats.recording_set.files import locate
 from lab.formats.results import CameraFit, FitResult, Skipped, SpectralFit
 from lab.formats.results.plausible import implausible_figures
 from lab.formats.spectrum_csv import parse_spectrum
+from lab.observables.spectra.light_readings import RADIOMETER_STD
 from sim.spectrum import FloatArray, Spectrum
 
 #: Of the stated width: halves of it first, and where these are likelier, what lies between. Wider light isn't tried,
@@ -424,7 +424,7 @@ def _signals(
         found[channel] = ChannelSignals(
             np.array([_photons(one, wave, factor) for one in own]) / photons * trapezoid_weights(wave),
             value,
-            np.hypot(noise, RADIOMETER_RELATIVE_STD * value),
+            np.hypot(noise, RADIOMETER_STD * value),
             tuple(f"{one.wavelength_nm} nm, {one.power}" for one in own),
             np.zeros((0, wave.size)),
             np.zeros(0),

@@ -20,7 +20,6 @@ from lab.fit.spectral.maker_curves import compare_curves, solve_with_maker
 from lab.fit.spectral.sensitivity import (
     COVERAGE_FACTOR,
     NEGATIVE_LIGHT,
-    RADIOMETER_RELATIVE_STD,
     ChannelSignals,
     Sensitivity,
     different_spectra,
@@ -34,6 +33,7 @@ from lab.formats.results import MakerDeparture, NoiseFit, RepeatDrift, SpectralF
 from lab.observables.codes.step import find_code_step
 from lab.observables.noise.levels import darks_near
 from lab.observables.plane_means import ChannelMean, central_codes, central_part, channel_means
+from lab.observables.spectra.light_readings import RADIOMETER_STD
 from lab.observables.weighted_lines import DarkLine, dark_line
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
@@ -262,7 +262,7 @@ class SpectralCaptures:
                     mean = float(np.sum(weight * [rate for rate, _ in usable]) / weight.sum())
                     mean_std = float(np.sqrt(1.0 / weight.sum()))
                     seen.append(path)
-                    good.append((light * weights, mean, float(np.hypot(mean_std, RADIOMETER_RELATIVE_STD * mean))))
+                    good.append((light * weights, mean, float(np.hypot(mean_std, RADIOMETER_STD * mean))))
                 else:
                     # A saturated mean is a lower limit, less 1 % for its noise
                     high.append((light * weights, 0.99 * max(rate for rate, *_ in found)))
@@ -323,7 +323,7 @@ class SpectralCaptures:
                 seen.append(path)
                 rows.append((self.photon_rate(path) * weights)[None])
                 values_.append(np.array([mean]))
-                stds.append(np.array([mean * np.hypot(RADIOMETER_RELATIVE_STD, outside)]))
+                stds.append(np.array([mean * np.hypot(RADIOMETER_STD, outside)]))
             result[channel] = ChannelSignals(
                 np.concatenate(rows),
                 np.concatenate(values_),

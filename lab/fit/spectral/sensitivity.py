@@ -27,9 +27,9 @@ from lab.fit.spectral.curve_prior import (
     straight_lines,
     within_bounds,
 )
+from lab.observables.spectra.light_readings import RADIOMETER_STD
 from sim.spectrum import FloatArray
 
-RADIOMETER_RELATIVE_STD = 0.003  # repeatability of a measured spectrum
 LEAST_OWN_SHARE = 1e-6  # of a channel's highest signal: the least standard deviation that is its own
 
 #: ln of the likelihood ratio from which on scatter of several channels is counted (Akaike's for one parameter; what the
@@ -97,7 +97,7 @@ class ChannelSignals:
 
     def without_shared_error(self, scatter: Scatter) -> ChannelSignals:
         """Return the signals with `scatter`, and without the radiometer's repeatability, which the channels share."""
-        square = self.std**2 - (RADIOMETER_RELATIVE_STD * self.value) ** 2
+        square = self.std**2 - (RADIOMETER_STD * self.value) ** 2
         least = LEAST_OWN_SHARE * float(np.max(np.abs(self.value)))
         return replace(self, std=np.sqrt(np.maximum(square, least**2))).with_scatter(scatter)
 
@@ -151,7 +151,7 @@ def scatter_evidence(
     value = np.concatenate([s.value for s in signals])
     light = np.concatenate([np.array(s.light) for s in signals])
     several = len(signals) > 1
-    read = RADIOMETER_RELATIVE_STD if several else 0.0  # part of the stated standard deviations, common to the channels
+    read = RADIOMETER_STD if several else 0.0  # part of the stated standard deviations, common to the channels
     own = np.maximum(
         np.concatenate([s.std for s in signals]) ** 2 - (read * value) ** 2, 1e-20 * float(np.max(value**2))
     )
@@ -297,7 +297,7 @@ def different_spectra(light: FloatArray) -> int:
     counts once.
     """
     unit = light / np.linalg.norm(light, axis=1, keepdims=True)
-    return int(np.sum(np.linalg.svd(unit, compute_uv=False) > np.sqrt(2.0) * RADIOMETER_RELATIVE_STD))
+    return int(np.sum(np.linalg.svd(unit, compute_uv=False) > np.sqrt(2.0) * RADIOMETER_STD))
 
 
 def trapezoid_weights(wave: FloatArray) -> FloatArray:
@@ -342,7 +342,7 @@ def solve_sensitivities(
     for c, prior in priors.items():
         own = signals[c].with_scatter(scatter)
         one = posterior_under_prior(wave, own.operator, own.value, own.std, prior)
-        common = RADIOMETER_RELATIVE_STD * one.gain @ errors[c]
+        common = RADIOMETER_STD * one.gain @ errors[c]
         curves[c] = _within(wave, own, one.mean, one.covariance, common)
     return curves, scatter
 
@@ -359,7 +359,7 @@ def _solve_together(
     errors = light_errors(signals)
     own = {c: s.without_shared_error(Scatter(own=scatter.own)) for c, s in signals.items()}
     found = {c: posterior_under_prior(wave, s.operator, s.value, s.std, priors[c]) for c, s in own.items()}
-    shared = float(np.hypot(RADIOMETER_RELATIVE_STD, scatter.common))
+    shared = float(np.hypot(RADIOMETER_STD, scatter.common))
     precision = np.sum([errors[c].T @ one.precision @ errors[c] for c, one in found.items()], axis=0)
     covariance = np.linalg.inv(precision + np.eye(len(precision)) / shared**2)
     error = covariance @ np.sum([errors[c].T @ one.precision @ own[c].value for c, one in found.items()], axis=0)

@@ -225,7 +225,17 @@ def _light(recordings: RecordingSet, flat: FlatCapture) -> tuple[float, str]:
     if flat.radiance is None:
         return flat.exposure_s, "exposure"
     spectrum = recordings.spectrum(flat.radiance)
-    return flat.exposure_s * float(np.trapezoid(spectrum.value, spectrum.wavelength_nm)), "radiance"
+    return flat.exposure_s * float(np.trapezoid(spectrum.value, spectrum.wavelength_nm)), f"radiance{_colour(flat)}"
+
+
+def _colour(flat: FlatCapture) -> str:
+    """Return what is stated of a flat's spectrum, as the end of its scale's name: total radiances of different spectra
+    aren't comparable."""
+    if flat.wavelength_nm is not None:
+        return f" at {flat.wavelength_nm:g} nm"
+    if flat.colour_temperature_k is not None:
+        return f" of {flat.colour_temperature_k:g} K"
+    return "" if flat.lamp_levels is None else f" of the channels {', '.join(sorted(flat.lamp_levels))}"
 
 
 def flat_level(recordings: RecordingSet, flat: FlatCapture, clipped: dict[str, float]) -> ClippedLevel:

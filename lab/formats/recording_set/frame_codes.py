@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -143,6 +143,10 @@ class FrameCodes:
         _count(np.ascontiguousarray(frame, np.uint16), counts)
         digest = hashlib.blake2b(np.ascontiguousarray(frame).data, digest_size=16).digest() if with_digest else b""
         return cls(tuple(CodeCounts.of(one) for one in counts), digest)
+
+    def moved(self, row: int, col: int) -> FrameCodes:
+        """Return the codes of a part that begins at `row` and `col` of a frame, by the cells of that frame's mosaic."""
+        return replace(self, cells=tuple(self.cells[CELLS.index(((r - row) % 2, (c - col) % 2))] for r, c in CELLS))
 
     @cached_property
     def every(self) -> CodeCounts:

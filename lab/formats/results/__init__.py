@@ -4,6 +4,7 @@
 """
 
 from lab.formats.results.diagnosis import (
+    Combination,
     DiagnosisLists,
     DiagnosisResult,
     DiagnosisVerdict,
@@ -28,9 +29,11 @@ from lab.formats.results.diagnosis import (
     RivalOdds,
     SideModels,
     Unexplained,
+    Unlisted,
     VetoedName,
     Visibility,
 )
+from lab.formats.results.estimate import Estimate
 from lab.formats.results.fit import (
     BoardWarp,
     CameraFit,
@@ -64,6 +67,15 @@ from lab.formats.results.fit import (
     StereoFit,
     ViewResiduals,
 )
+from lab.formats.results.standards import (
+    Deviation,
+    PlotCurve,
+    StandardFigure,
+    StandardMap,
+    StandardPlot,
+    StandardReading,
+    StandardsResult,
+)
 from lab.formats.results.validation import (
     Change,
     Check,
@@ -83,6 +95,7 @@ __all__ = [
     "ChannelGeometry",
     "ChannelNoise",
     "Check",
+    "Combination",
     "ComparisonResult",
     "CornerErrors",
     "CrossValidation",
@@ -90,6 +103,7 @@ __all__ = [
     "DarkCurrentLaws",
     "Defect",
     "DepthUncertainty",
+    "Deviation",
     "DiagnosisLists",
     "DiagnosisResult",
     "DiagnosisVerdict",
@@ -99,6 +113,7 @@ __all__ = [
     "EffectSet",
     "Emva1288",
     "Emva1288Points",
+    "Estimate",
     "ExaminedPlace",
     "FitResult",
     "GeometryFit",
@@ -118,6 +133,7 @@ __all__ = [
     "PatchComparison",
     "PhotonTransfer",
     "PixelDefects",
+    "PlotCurve",
     "PolicyRule",
     "ProjectionChange",
     "ProjectionUncertainty",
@@ -137,8 +153,14 @@ __all__ = [
     "SideModels",
     "Skipped",
     "SpectralFit",
+    "StandardFigure",
+    "StandardMap",
+    "StandardPlot",
+    "StandardReading",
+    "StandardsResult",
     "StereoFit",
     "Unexplained",
+    "Unlisted",
     "ValidationResult",
     "VetoedName",
     "ViewResiduals",

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+from lab.engine import Engine
+from lab.formats.results.estimate import Estimate
 from lab.formats.results.fit import Skipped
 from lab.shown import Tabular
 from sim.camera import Side
@@ -14,6 +16,9 @@ from sim.parameters import Frozen
 DiagnosisVerdict = Literal["no_mismatch", "explained", "partly_explained", "unexplained", "nothing_judged"]
 #: Where a correction of the sensitivities stands, in words.
 IN_CURVES = "in the sensitivity curves"
+#: Standard deviations of a normal distribution to either side that hold 95 %, and those by which the ends of an
+#: interval may differ from them where the distribution counts as normal.
+NORMAL_95, SKEWED = 1.96, 0.5
 
 
 class Mismatch(Frozen):
@@ -27,18 +32,42 @@ class Mismatch(Frozen):
     captures: tuple[str, ...]
 
 
-class ParameterValue(Frozen):
+class ParameterValue(Estimate):
     """An estimated parameter of an effect.
 
     `sign_known`: False where the recordings show its size only, as it acts by its square. `interval`: from low to high,
-    95 %, of a value whose error no normal distribution describes; it has no standard deviation.
+    95 %. `is_determined`: False where that interval holds the value at which the effect is absent: its size isn't
+    determined, the name stands.
     """
 
-    value: float
-    std: float | None
-    unit: str
     sign_known: bool = True
     interval: tuple[float, float] | None = None
+    is_determined: bool = True
+
+    @property
+    def shown_interval(self) -> tuple[float, float] | None:
+        """The interval, where `value` and `std` as a normal distribution don't describe it."""
+        if self.interval is None or not self.std:
+            return self.interval
+        ends = (self.value - NORMAL_95 * self.std, self.value + NORMAL_95 * self.std)
+        apart = max(abs(one - other) for one, other in zip(ends, self.interval, strict=True))
+        return self.interval if apart > SKEWED * self.std or not self.is_determined else None
+
+
+class Combination(Frozen):
+    """What the recordings determine of parameters that they can't tell apart: the sum of `weights` times `parameters`,
+    each less its value in absence and raised to `power`, with the size's own sign.
+
+    The weights are the direction; the first is 1, and the unit that of the first parameter to that power.
+    """
+
+    side: Side
+    parameters: tuple[str, ...]
+    weights: tuple[float, ...]
+    power: int
+    value: float
+    std: float
+    unit: str
 
 
 class Rival(Frozen):
@@ -56,13 +85,14 @@ class Member(Frozen):
 
 
 class NamedEffect(Frozen):
-    """An effect that the diagnosis names, or the family of one, with its posterior probability.
+    """An effect that the diagnosis names, or the family of one, with its posterior probability. By the engine
+    `evidence`, an effect of a camera has an entry for each side, one of the light, the screen or the chart one entry.
 
     `law`: `exact` where what the effects leave is within noise and the laws' tolerances, else `inexact`. `members`:
     where the family is named, its effects, likeliest first; `name` is then the family's identifier, and `parameters`
-    are those of the first member. `choices`: which of its alternatives the law is, by field: the corner of a glow.
-    `modes`: other values of the parameters, in their units, that fit as well. `shown_in`: measurements in which it
-    stands out of the noise, strongest first.
+    are those of the first member. `combinations`: of parameters that aren't determined by themselves. `choices`: which
+    of its alternatives the law is, by field: the corner of a glow. `modes`: other values of the parameters, in their
+    units, that fit as well. `shown_in`: measurements in which it stands out of the noise, strongest first.
     """
 
     name: str
@@ -72,6 +102,7 @@ class NamedEffect(Frozen):
     probability: float
     sides: tuple[Side, ...]
     parameters: dict[str, ParameterValue]
+    combinations: tuple[Combination, ...] = ()
     choices: dict[str, str] = {}
     modes: tuple[dict[str, float], ...] = ()
     shown_in: tuple[str, ...] = ()
@@ -155,6 +186,18 @@ class DiscoveredLaw(Frozen):
     statement: str
 
 
+class Unlisted(Frozen):
+    """Unlisted physics that acts on one state of the chain of light, with its posterior probability.
+
+    `measurements`: those that show it, strongest first. `where`: the part of the first of them that shows it."""
+
+    side: Side
+    state: str
+    measurements: tuple[str, ...] = ()
+    probability: float
+    where: str = ""
+
+
 class VetoedName(Frozen):
     """An effect that the captures used for the choice suggest, and that held-out captures contradict: it isn't named.
 
@@ -209,11 +252,13 @@ class ResidualCurve(Frozen):
 
 class EffectSet(Frozen):
     """A set of effects that may act together, with its posterior probability; the empty set is the baseline.
-    `refitted`: its parameters were fitted; otherwise the probability is of the linear problem about a likely set."""
+    `refitted`: its parameters were fitted; otherwise the probability is of the linear problem about a likely set.
+    `unlisted`: states of the chain of light on which unlisted physics acts beside them."""
 
     effects: tuple[str, ...]
     probability: float
     refitted: bool = True
+    unlisted: tuple[str, ...] = ()
 
 
 class IncludedEffect(Frozen):
@@ -224,30 +269,36 @@ class IncludedEffect(Frozen):
 
 
 class SideModels(Frozen):
-    """What the search says of one side, if every cause is a listed effect.
+    """The table of sets of one side. Probabilities are unconditional where the result's `engine` is `evidence`, else
+    conditional on every cause being a listed effect.
 
     `sets`: the fewest sets of effects that together hold `share` of the probability, likeliest first. `inclusion`: of
     all sets that were fitted, likeliest first. `not_weighed`: sets that promised enough and that the budget of CPU time
-    left without a refit."""
+    left without a refit. `never_refitted`: the probability of sets that had to be refitted and never were;
+    `closed_form`: of those whose probability the recordings hardly change; None: not stated."""
 
     side: Side
     share: float
     sets: tuple[EffectSet, ...]
     inclusion: tuple[IncludedEffect, ...]
     not_weighed: tuple[tuple[str, ...], ...] = ()
+    never_refitted: float | None = None
+    closed_form: float | None = None
 
 
 class NextCapture(Frozen):
     """A capture that could be taken to tell rivals apart.
 
     `distance`: D = 1/2 d' C^-1 d of the two nearest rivals, with d the difference of their predictions and C the
-    covariance of the measurement. `told_apart`: probability Phi(sqrt(D / 2)) of a right decision between them."""
+    covariance of the measurement. `told_apart`: probability Phi(sqrt(D / 2)) of a right decision between them.
+    `settles`: probability that afterwards one of all rivals holds the threshold of a name; None: not computed."""
 
     side: Side
     capture: str
     rivals: tuple[str, str]
     distance: float
     told_apart: float
+    settles: float | None = None
 
 
 class ExaminedPlace(Frozen):
@@ -328,7 +379,8 @@ class Resolution(Frozen):
     `session` holds its frames; `verdict_before`, `effects_before`: the diagnosis before it. `rivals`, `rivals_after`:
     what was and what is in doubt, or the names that stand there; None while no diagnosis has said it yet. `then`: the
     capture that is planned after it, as only both together tell. `information_nat`: expected information of the capture
-    (of both), `expected_s` and `spent_s`: lab time that was expected and that it took.
+    (of both). `settles`: probability that one rival holds the threshold of a name afterwards. `expected_s` and
+    `spent_s`: lab time that was expected and that it took.
     """
 
     capture: str
@@ -339,6 +391,7 @@ class Resolution(Frozen):
     rivals: tuple[RivalOdds, ...] = ()
     then: str = ""
     information_nat: float | None = None
+    settles: float | None = None
     expected_s: float | None = None
     spent_s: float | None = None
     rivals_after: tuple[RivalOdds, ...] | None = None
@@ -372,6 +425,7 @@ class DiagnosisLists(Frozen):
 
     mismatches: tuple[Mismatch, ...] = ()
     unexplained: tuple[Unexplained, ...] = ()
+    unlisted: tuple[Unlisted, ...] = ()
     vetoed: tuple[VetoedName, ...] = ()
     discovered: tuple[DiscoveredLaw, ...] = ()  # the most significant first, for each side
     models: tuple[SideModels, ...] = ()
@@ -396,6 +450,7 @@ class DiagnosisResult(Tabular, DiagnosisLists):
     format: Literal["calibench-diagnosis"] = "calibench-diagnosis"
     version: Literal[1] = 1
     source: str
+    engine: Engine = "today"
     verdict: DiagnosisVerdict
     effects: tuple[NamedEffect, ...] = ()
     held_out: HeldOut | None = None

@@ -13,7 +13,7 @@ from lab.observables.boards.corners import board_corners, channel_corners, plane
 from lab.observables.boards.residuals import FEWEST_CORNERS
 from lab.observables.boards.shift_fit import fit_shift
 from lab.observables.boards.views import BoardView
-from lab.observables.colour_shift import COLOUR_FLOOR_PX, REFERENCE_NM, colour_shift_px, outward_shifts_px
+from lab.observables.colour_shift import REFERENCE_NM, colour_shift_px, outward_shifts_px
 from lab.observables.dataset import Dataset
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
@@ -128,7 +128,7 @@ def measure_board_colour(dataset: Dataset) -> Observable:
 
     return Observable(
         measurement=BOARD_COLOUR, reach=0.5, value=np.array([ring.outwards_px for ring in rings]),
-        covariance=_covariance(rings) + np.diag(np.full(len(rings), COLOUR_FLOOR_PX**2)), labels=tuple(labels),
+        covariance=_covariance(rings), labels=tuple(labels),
         reads=frozenset({"image.shift"}), predict=predict, scale=np.ones(len(rings)),
     )  # fmt: skip
 

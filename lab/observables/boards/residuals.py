@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,10 +29,12 @@ from sim.spectrum import FloatArray
 
 ROWS, COLS = 3, 4  # cells of the frame
 FEWEST_CORNERS = 6  # of a cell
-#: Standard deviation of a cell's displacement by what the geometry leaves out, beside the errors of its corners.
-CELL_FLOOR_PX = 0.006
 #: Prior standard deviation of a known distortion, at the frame's corner, of each of its terms.
 CALIBRATED_STD_PX = 0.05
+#: Share of a standard deviation that a residual may be wrong by where displacements enter linearly.
+LINEAR_SHARE = 0.1
+#: Steps of a fixed point: a displacement that grows by 2 % over a pixel is found to 1e-5 of it.
+PLACING_STEPS = 3
 HELD_OUT_FROM = 6  # views; of as many or more, every third is held out
 
 
@@ -44,6 +46,7 @@ class CellResiduals:
     noise, and what neighbours share. `labels` (m): distance from the middle, half diagonals; direction; captures;
     whether held out. `place` (n, 2): the corners, (x, y) px. `operator` (m, 2 n): what a displacement of the corners
     changes, after the fitted parameters have taken up their part of it. `solution`: about which that is linear.
+    `refitted`: maps a displacement of the corners (n, 2) to what it changes, whatever its size.
     """
 
     value: FloatArray
@@ -52,6 +55,18 @@ class CellResiduals:
     place: FloatArray
     operator: FloatArray
     solution: Solution
+    refitted: Callable[[FloatArray], FloatArray]
+
+    def change(self, shift_px: FloatArray) -> FloatArray:
+        """Return what a displacement (n, 2) of the corners, px, adds to `value`.
+
+        Beyond the operator it is quadratic, the displacement squared over the focal length. Where that is more than
+        `LINEAR_SHARE` of a standard deviation, the camera is fitted again without the displacement."""
+        focal_px = float(self.solution.state.intrinsics[0, 0])
+        quadratic = float(np.max(np.sum(np.square(shift_px), axis=1), initial=0.0)) / focal_px
+        if quadratic < LINEAR_SHARE * float(np.sqrt(np.min(np.diag(self.covariance)))):
+            return self.operator @ shift_px.ravel()
+        return self.refitted(shift_px)
 
 
 def cell_residuals(calibration: Calibration, known: CameraGeometry | None = None) -> CellResiduals:
@@ -79,9 +94,17 @@ def cell_residuals(calibration: Calibration, known: CameraGeometry | None = None
     mean, labels = _averages(place, cells, shape)
     taken = _taken_up(bundle, solution)
     operator = mean - (mean @ taken) @ taken.T
+    value = mean @ np.concatenate(solution.residuals).ravel()
+
+    def refitted(shift_px: FloatArray) -> FloatArray:
+        at = np.split(place - shift_px, np.cumsum([len(view.index) for view in views])[:-1])
+        without = [replace(view, image_px=moved) for view, moved in zip(views, at, strict=True)]
+        fitted = BundleAdjustment(observations_of(without), free[None, :], shape).solve(solution.state)
+        return np.asarray(value - mean @ np.concatenate(fitted.residuals).ravel())
+
     captures = [view.capture.id for view in views]
     return CellResiduals(
-        value=mean @ np.concatenate(solution.residuals).ravel(),
+        value=value,
         covariance=_propagated(operator, calibration),
         labels=tuple(
             (radius, way, tuple(captures[k] for k in np.unique(of_view[use])), held_out)
@@ -90,6 +113,7 @@ def cell_residuals(calibration: Calibration, known: CameraGeometry | None = None
         place=place,
         operator=operator,
         solution=solution,
+        refitted=refitted,
     )
 
 
@@ -137,23 +161,29 @@ def measure_boards(dataset: Dataset) -> Observable:
     jacobian = {} if known is None else _calibrated(found, calibration.shape)
 
     def predict(effects: Effects) -> Prediction:
-        return Prediction(found.operator @ shifts_px(dataset, found.place, effects).ravel(), jacobian)
+        return Prediction(found.change(shifts_px(dataset, found.place, effects)), jacobian)
 
     return Observable(
         measurement=BOARDS, reach=0.4, value=found.value,
-        covariance=found.covariance + np.diag(np.full(count, CELL_FLOOR_PX**2)),
+        covariance=found.covariance,
         labels=tuple(Label(radius, "Y", way, captures, out) for radius, way, captures, out in found.labels),
         reads=frozenset({"image.shift"}), predict=predict, scale=np.ones(count),
     )  # fmt: skip
 
 
 def shifts_px(dataset: Dataset, place: FloatArray, effects: Effects) -> FloatArray:
-    """Displacement (n, 2) of the image by the effects, px, at `place` (n, 2), (x, y) px, at `REFERENCE_NM`."""
+    """Return the displacement (n, 2), px, by the effects at `REFERENCE_NM` of what is found at `place` (n, 2), (x, y)
+    px: without them, it would be found at `place` less the displacement."""
     camera = dataset.camera
-    pitch = camera.pixel_pitch_um
-    x, y = ((place[:, k] - 0.5 * (n - 1)) * pitch for k, n in ((0, camera.cols), (1, camera.rows)))
-    shift = displaced_um(camera, x, y, REFERENCE_NM, effects)
-    return np.zeros_like(place) if shift is None else np.column_stack(shift) / pitch
+    pitch, middle = camera.pixel_pitch_um, 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
+    found = np.zeros_like(place)
+    for _ in range(PLACING_STEPS if effects else 0):
+        x_um, y_um = ((place - found - middle) * pitch).T
+        shift = displaced_um(camera, x_um, y_um, REFERENCE_NM, effects)
+        if shift is None:
+            break
+        found = np.column_stack(shift) / pitch
+    return found
 
 
 def _cells(

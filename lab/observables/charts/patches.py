@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture_kinds.chart import ChartCapture
+from lab.formats.recording_set import CodeCounts, FrameCodes, RecordingSet
 from lab.observables.dataset import CLIPPED_SHARE, Dataset, held_out_of, mean_frame
-from lab.observables.plane_means import channel_pixels
 from lab.observables.surroundings import Surroundings, harmonics
 from sim.point import optical_transfer
 from sim.scene.colorchecker import reflectances
@@ -17,6 +17,7 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
 StrArray = NDArray[np.str_]
+LEAST_PIXELS = 16  # of a channel, of a patch that is used
 PATCH_STD = 0.01  # relative standard deviation of a patch's reflectance, common to the channels
 PATCH_COLOUR_STD = 0.004  # the same, independent in each channel
 PATCH_LEVEL_STD = (
@@ -41,36 +42,51 @@ class Patch:
     held_out: bool
 
 
+def patch_codes(recordings: RecordingSet, capture: ChartCapture) -> tuple[FrameCodes, ...]:
+    """Return the codes of the inner part of each patch of one frame, in the chart's order, by cell of the frame's 2 x 2
+    mosaic. They are counted once, whatever the manifest states of camera and light."""
+
+    def counted() -> tuple[FrameCodes, ...]:
+        frame = recordings.frame(capture)
+        return tuple(
+            FrameCodes.count(frame[slice(*rows), slice(*cols)]).moved(rows[0], cols[0])
+            for _, rows, cols, *_ in patch_boxes(capture)
+        )
+
+    key = "patches", capture.frame, capture.chart, capture.corners
+    return recordings.once(key, counted, whatever_is_stated=True)
+
+
 def patch_levels(dataset: Dataset) -> list[Patch]:
     """Return the unclipped patches of all ColorChecker24 captures, by channel, seen and held-out repeats apart."""
     groups = dataset.groups(ChartCapture, lambda c: (c.chart, c.exposure_s, c.radiance, c.corners))
     groups = [g for g in groups if g[0].chart == "ColorChecker24"]
-    step = mosaic.step(dataset.camera.cfa)
+    recordings, cfa = dataset.recordings, dataset.camera.cfa
+    step = mosaic.step(cfa)
     points = []
     for i, group in enumerate(groups):
         out = held_out_of(group, i, len(groups))
         for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
             if not part:
                 continue
-            frame = mean_frame(dataset.recordings, part)
-            clipped = dataset.recordings.frame(part[0]) >= dataset.saturation_dn
+            patches = [patch_codes(recordings, capture) for capture in part]
+            frame = mean_frame(recordings, part)
             for channel in dataset.channels:
-                first_row, first_col = mosaic.phases(dataset.camera.cfa)[channel][0]
+                first_row, first_col = mosaic.phases(cfa)[channel][0]
                 plane = frame[first_row::step, first_col::step]
                 spread = _spread(dataset, plane, channel, part[0].radiance)
-                mean = float(channel_pixels(frame, dataset.camera.cfa, channel).mean())
+                mean = CodeCounts.total(cell for c in part for cell in recordings.codes(c).channels(cfa)[channel])
                 low = harmonics(plane - dataset.noise.black - dataset.noise.dark_dn_per_s * part[0].exposure_s)
-                mask = dataset.plane_mask(channel, (dataset.camera.rows, dataset.camera.cols))
-                for name, rows, cols, row, col in patch_boxes(part[0]):
-                    box = (slice(*rows), slice(*cols))
-                    values = frame[box][mask[box]]
-                    if values.size < 16 or np.mean(clipped[box][mask[box]]) >= CLIPPED_SHARE:
+                for k, (name, rows, cols, row, col) in enumerate(patch_boxes(part[0])):
+                    cells = [one[k].channels(cfa).get(channel, ()) for one in patches]
+                    counts, first = CodeCounts.total(cell for own in cells for cell in own), CodeCounts.total(cells[0])
+                    if first.pixels < LEAST_PIXELS or first.share_from(dataset.saturation_dn) >= CLIPPED_SHARE:
                         continue
                     inside = slice(rows[0] // step, rows[1] // step), slice(cols[0] // step, cols[1] // step)
                     points.append(
-                        Patch(tuple(part), name, channel, float(values.mean()), values.size, row, col, mean,
-                        Surroundings.of_box(low, plane.shape, *inside),
-                              float(spread[inside].mean()), part[0].id in out)
+                        Patch(tuple(part), name, channel, counts.mean_dn, first.pixels, row, col, mean.mean_dn,
+                              Surroundings.of_box(low, plane.shape, *inside), float(spread[inside].mean()),
+                              part[0].id in out)
                     )  # fmt: skip
     return points
 

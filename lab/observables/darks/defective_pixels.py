@@ -142,13 +142,20 @@ class _DefectClass:
     more_dn: float  # additional dark signal
     jump_dn: float  # distance of the two levels of telegraph noise, 0 without
     high_share: float = 0.5  # share of the frames at the higher level
+    spread_dn: float = 0.0  # standard deviation of the additional dark signal, which a pixel has in all frames
 
 
 def _defect_classes(model: Uniform, gain: float, exposure_s: float) -> list[_DefectClass]:
-    """Return the defective pixels of a model's effects, by the nodes of their distributions of size."""
+    """Return the defective pixels of a model's effects, by the nodes of their distributions of size. Each stands for
+    a part of it: nodes alone would lie farther apart than the noise is wide, and counts in a bin jump where one
+    passes its edge."""
     found = []
     for hot in model.hot:
-        found += [_DefectClass(float(s), gain * float(x) * exposure_s, 0.0) for s, x in zip(*hot.nodes(), strict=True)]
+        to_dn = gain * exposure_s
+        found += [
+            _DefectClass(float(s), to_dn * float(x), 0.0, spread_dn=to_dn * float(w))
+            for s, x, w in zip(*hot.nodes(), hot.node_std(), strict=True)
+        ]
     for jumps in model.telegraph:
         found += [
             _DefectClass(float(s), 0.0, gain * float(x), jumps.high_share) for s, x in zip(*jumps.nodes(), strict=True)
@@ -165,7 +172,8 @@ def _tail_shares(
     `skew`, on a normal fixed deviation of standard deviation `fixed` (DN). It is compared with the edges times `spread`
     (DN)."""
     low = np.array([*TAIL_EDGES, -TAIL_EDGES[0], -TAIL_EDGES[1]]) * spread + _order_moments(frames)[0] * moving
-    u = np.linspace(-7.5, 7.5, 61) if fixed > 0.02 * moving else np.zeros(1)
+    own = np.hypot(fixed, [0.0, *(c.spread_dn for c in classes)])
+    u = np.linspace(-7.5, 7.5, 61) if own.max() > 0.02 * moving else np.zeros(1)
     weight = np.exp(-0.5 * u * u)
     weight /= weight.sum()
     rest = 1.0 - sum(c.share for c in classes)
@@ -174,7 +182,7 @@ def _tail_shares(
     jump = np.array([0.0, *(c.jump_dn for c in classes)])
     high = np.array([0.5, *(c.high_share for c in classes)])[:, None, None]
     s = np.sqrt(moving**2 + gain * more)
-    at = low[None, :, None] - fixed * u[None, None, :] - more[:, None, None]
+    at = low[None, :, None] - own[:, None, None] * u[None, None, :] - more[:, None, None]
     low_level, high_level = (
         _upper((at - level * jump[:, None, None]) / s[:, None, None], skew) for level in (-high, 1.0 - high)
     )

@@ -26,7 +26,10 @@ def measure_dark_field(dataset: Dataset) -> Observable:
     The level of each mean frame is a nuisance parameter. Raises NotDetermined where cells are narrower than `CELL_PX`.
     """
     frames = [f for f in dataset.once(dark_frames) if f.fixed]
-    points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
+    # frames all of whose codes are equal have no scatter: rounding hides it
+    points = [(f, out, part) for f in frames for out, part in f.fixed.items() if np.ptp(part.cells) > 0]
+    if not points:
+        raise NotDetermined("dark_field", "every pixel of the dark frames has the same code: raise the gain")
     rows, cols = CELLS
     count = rows * cols
     if min(dataset.camera.rows // rows, dataset.camera.cols // cols) < CELL_PX:

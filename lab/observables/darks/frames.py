@@ -326,7 +326,7 @@ def cell_means(image: Image, cells: tuple[int, int] = CELLS) -> FloatArray:
     """Return the means of an image over `cells`, rows and columns of equal parts."""
     r = np.linspace(0, image.shape[0], cells[0] + 1).astype(int)
     c = np.linspace(0, image.shape[1], cells[1] + 1).astype(int)
-    total = np.add.reduceat(np.add.reduceat(image.astype(float), r[:-1], 0), c[:-1], 1)
+    total = np.add.reduceat(np.add.reduceat(image, r[:-1], 0, dtype=float), c[:-1], 1)
     return np.asarray(total / np.outer(np.diff(r), np.diff(c)))
 
 

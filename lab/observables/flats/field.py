@@ -4,12 +4,13 @@ fall-off."""
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lab.errors import NotDetermined
 from lab.observables.dataset import Dataset, held_out_flats
@@ -28,8 +29,6 @@ from sim.uniform import SHADING, STRAYS, FieldPoints, Uniform
 #: Read-outs whose effect on the cells is kept: a refit varies one effect's parameters beside the others' as they stand.
 CACHED_READ_OUTS = 64
 ROWS, COLS = 6, 8  # cells of the frame
-#: Relative standard deviation of a cell, common to repeats: numerical error of the prediction.
-SHADING_FLOOR = 2e-4
 AXIS_STD, AXIS_STD_KNOWN = (
     0.01,
     0.004,
@@ -81,7 +80,8 @@ def measure_flat_field(dataset: Dataset) -> Observable:
 
     off_px = (AXIS_STD_KNOWN if camera.geometry is not None else AXIS_STD) * float(np.hypot(camera.rows, camera.cols))
     place = _cell_points(camera, 0.0, 0.0)
-    moved = {"axis:row": _cell_points(camera, off_px, 0.0), "axis:col": _cell_points(camera, 0.0, off_px)}
+    lit = _channel_points(camera, 0.0, 0.0)
+    moved = {"axis:row": _channel_points(camera, off_px, 0.0), "axis:col": _channel_points(camera, 0.0, off_px)}
     x_mm, y_mm = (_cell_means(v) * 1e-3 for v in (place.x_um, place.y_um))
 
     @lru_cache(maxsize=CACHED_READ_OUTS)
@@ -93,10 +93,13 @@ def measure_flat_field(dataset: Dataset) -> Observable:
         own, model = _own_factors(planes, place, effects, dataset), Uniform(camera, effects)
         read_out = of_pixels(acting(effects, ADDED | GAINS))
         even = even_share(camera, effects)
-        base = _shaded(planes, place, model, even, read_out, own)
-        axis = {name: _shaded(planes, off, model, even, read_out, own) - base for name, off in moved.items()}
-        scatter = _row_light(planes, base, model, camera.rows) | _line_gains(planes, base, model, camera)
-        return Prediction(base, axis | scatter)
+        base = _shaded(planes, lit, model, even, read_out, own)
+
+        def jacobian() -> dict[str, FloatArray]:
+            axis = {name: _shaded(planes, off, model, even, read_out, own) - base for name, off in moved.items()}
+            return axis | _row_light(planes, base, model, camera.rows) | _line_gains(planes, base, model, camera)
+
+        return Prediction(base, jacobian)
 
     radius = np.hypot(x_mm, y_mm)
     return Observable(
@@ -215,7 +218,7 @@ def _covariance(planes: Sequence[_ChannelCells]) -> FloatArray:
         for j, b in enumerate(planes):
             part = covariance[i * cells : (i + 1) * cells, j * cells : (j + 1) * cells]
             if a.channel == b.channel:
-                part += np.eye(cells) * (np.sqrt(a.pattern * b.pattern) + SHADING_FLOOR**2)
+                part += np.eye(cells) * np.sqrt(a.pattern * b.pattern)
             if i == j:
                 part += np.eye(cells) * a.noise
             if a.held_out == b.held_out:
@@ -229,10 +232,32 @@ _POINTS, _SHARES = np.polynomial.legendre.leggauss(3)
 
 
 def _cell_points(camera: CameraModel, off_row_px: float, off_col_px: float) -> FieldPoints:
-    row = ((np.arange(ROWS)[:, None] + 0.5 + 0.5 * _POINTS) / ROWS).ravel() * camera.rows - 0.5 - off_row_px
-    col = ((np.arange(COLS)[:, None] + 0.5 + 0.5 * _POINTS) / COLS).ravel() * camera.cols - 0.5 - off_col_px
+    """Return the nodes of all cells, each as large as the pixels that `_cells` averages, with the optical axis moved by
+    `off_row_px` and `off_col_px`."""
+    step = mosaic.step(camera.cfa)
+    row, col = (
+        _nodes(size // step, count, step) - off
+        for size, count, off in ((camera.rows, ROWS, off_row_px), (camera.cols, COLS, off_col_px))
+    )
     grid_row, grid_col = np.meshgrid(row, col, indexing="ij")
     return FieldPoints.at(camera, grid_row.ravel(), grid_col.ravel())
+
+
+def _channel_points(camera: CameraModel, off_row_px: float, off_col_px: float) -> dict[str, FieldPoints]:
+    """Return the nodes of the cells by channel: its pixels stand up to half a pixel beside the mean of all."""
+    middle = 0.5 * (mosaic.step(camera.cfa) - 1)
+    found = {}
+    for channel, phases in mosaic.phases(camera.cfa).items():
+        row, col = np.mean(phases, axis=0) - middle
+        found[channel] = _cell_points(camera, off_row_px - float(row), off_col_px - float(col))
+    return found
+
+
+def _nodes(size: int, count: int, step: int) -> FloatArray:
+    """Return the nodes (3 count,), px of the frame, of `count` cells of a plane of `size` pixels, `step` px apart."""
+    edges = step * _edges(size, count) - 0.5
+    middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
+    return np.asarray((middle[:, None] + half[:, None] * _POINTS).ravel())
 
 
 def _cell_means(value: FloatArray) -> FloatArray:
@@ -257,7 +282,7 @@ def _read_out(model: Uniform) -> _ReadOut:
 
 def _shaded(
     planes: Sequence[_ChannelCells],
-    place: FieldPoints,
+    places: Mapping[str, FieldPoints],
     model: Uniform,
     even: float,
     read_out: _ReadOut,
@@ -265,14 +290,16 @@ def _shaded(
 ) -> FloatArray:
     """Predicted cells of all planes, each relative to its mean, (planes x cells,). `even`: share of the light that a
     veil spreads; `factors` of `_own_factors`."""
-    light = _cell_means(model.field(place).light)
-    # a veil of scattered light reduces the contrast of the fall-off
-    light = (1.0 - even) * light + even * light.mean()
-    leaked_s = _cell_means(model.leaked_s(place))
+    lights = {}
+    for channel, place in places.items():
+        light = _cell_means(model.field(place).light)
+        # a veil of scattered light reduces the contrast of the fall-off
+        lights[channel] = (1.0 - even) * light + even * light.mean()
     found = []
     for plane, factor in zip(planes, factors, strict=True):
-        own = light * factor
+        own = lights[plane.channel] * factor
         if model.leaks:
+            leaked_s = _cell_means(model.leaked_s(places[plane.channel]))
             own = own * (1.0 + leaked_s * float(np.mean([1.0 / c.exposure_s for c in plane.captures])))
         electrons = model.response(own / own.mean() * plane.level_e) * read_out.gain
         found.append(electrons / electrons.mean() + read_out.added_e * plane.inverse_per_e)
@@ -352,9 +379,13 @@ def _line_gains(
 
 
 def _cells(plane: FloatArray) -> FloatArray:
-    r = np.linspace(0, plane.shape[0], ROWS + 1).astype(int)
-    c = np.linspace(0, plane.shape[1], COLS + 1).astype(int)
+    r, c = _edges(plane.shape[0], ROWS), _edges(plane.shape[1], COLS)
     return np.add.reduceat(np.add.reduceat(plane, r[:-1], 0), c[:-1], 1) / np.outer(np.diff(r), np.diff(c))
+
+
+def _edges(size: int, count: int) -> NDArray[np.int64]:
+    """Return the borders (count + 1,) of `count` cells of whole pixels."""
+    return np.linspace(0, size, count + 1).astype(np.int64)
 
 
 FLAT_FIELD = Measurement(

@@ -19,6 +19,7 @@ from lab.observables.noise.line_means import LineMeans
 from lab.observables.noise.repeatability import level_std, weighted_median
 from lab.observables.observable import LEVEL_REACH, Label, Measurement, Observable, Prediction
 from lab.observables.reads import DARK_CURRENT, LAG, LINES, acting
+from lab.observables.spectra.light_readings import RADIOMETER_STD
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import LEVEL, SPECTRAL, Uniform, electron_rate
@@ -107,7 +108,7 @@ def _rate(dataset: Dataset, one: FlatLight, channel: str) -> float:
 
 def misstated_levels(fit: CameraFit | None) -> tuple[InconsistentLevel, ...]:
     """Levels whose stated number of photons contradicts the others, as found by the noise fit
-    (`lab.fit.noise.evaluation`)."""
+    (`lab.fit.noise.consistency`)."""
     if fit is None or fit.noise is None:
         return ()
     return tuple(level for level in fit.noise.inconsistent_levels if level.light_unit == "photons" and level.captures)
@@ -118,7 +119,6 @@ def misstated_levels(fit: CameraFit | None) -> tuple[InconsistentLevel, ...]:
 
 # Relative standard deviations.
 READING_COLOUR_STD = 5e-4  # of a radiometer's reading in one channel: its noise by wavelength
-RADIOMETER_STD = 0.002  # of a radiometer's reading, common to the channels; the most that narrowband readings may have
 
 
 def measure_photon_transfer(dataset: Dataset) -> Observable:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from sim.uniform import Uniform
 LEAST_PX = 32  # least side
 LEAST_DN = 0.3  # of codes of a step of 1 DN: temporal noise of a pixel below which codes are too coarse
 MOST_FRAMES, MOST_LEVELS = 16, 8  # frames of a setting; levels of a session
+#: Pixels of a setting that are held at once; as many know a correlation to 2e-4, but two frames in any case.
+MOST_PIXELS = 4e7
 CORRELATION_FLOOR = 2e-4  # standard deviation of a correlation beside chance
 PARTS = 8  # of a frame, from which the scatter of a correlation is measured
 
@@ -158,14 +161,15 @@ def _settings(dataset: Dataset) -> list[tuple[list[Any], bool, bool]]:
 
 def _pairs(dataset: Dataset) -> FloatArray:
     """Number of pairs of each relation, each counted once."""
-    frame = np.arange(dataset.camera.rows * dataset.camera.cols).reshape(dataset.camera.rows, dataset.camera.cols)
+    frame = np.broadcast_to(np.zeros(1, bool), (dataset.camera.rows, dataset.camera.cols))
     return np.array([float(one(frame)[0].size) for one in RELATIONS.values()])
 
 
 def _read(dataset: Dataset, captures: Sequence[Any], lit: bool, held_out: bool) -> _Correlations | None:
     """Return the correlations of the repeats of one setting; None where they clip, or codes are too coarse."""
     cfa = dataset.camera.cfa
-    frames = [np.array(dataset.recordings.frame(c), np.float32) for c in captures[:MOST_FRAMES]]
+    captures = captures[: int(np.clip(MOST_PIXELS / (dataset.camera.rows * dataset.camera.cols), 2, MOST_FRAMES))]
+    frames = [np.array(dataset.recordings.frame(c), np.float32) for c in captures]
     clipped = max(float(np.mean((f >= dataset.saturation_dn) | (f <= 0))) for f in frames)
     level = float(np.mean(frames[0])) - dataset.noise.black
     if lit and clipped > 0.1 * CLIPPED_SHARE:
@@ -184,29 +188,37 @@ def _read(dataset: Dataset, captures: Sequence[Any], lit: bool, held_out: bool) 
             plane[np.abs(plane) > OUTLIER] = 0.0
     sums, parts = [], []
     for one in RELATIONS.values():
-        products = np.array([a * b for a, b in map(one, frames)], np.float64)
-        sums.append(products.sum() / freedom / products[0].size)
-        split = [np.sum(p) for p in np.array_split(products.sum(0), PARTS, axis=0)]
-        parts.append(np.var(split, ddof=1) * PARTS / products[0].size / freedom)
+        by_row = sum(np.einsum("ij,ij->i", *one(frame), dtype=float) for frame in frames)
+        size = one(frames[0])[0].size
+        sums.append(by_row.sum() / freedom / size)
+        split = [np.sum(rows) for rows in np.array_split(by_row, PARTS)]
+        parts.append(np.var(split, ddof=1) * PARTS / size / freedom)
     value = np.array(sums) - _expected(dataset.camera.rows, dataset.camera.cols, mosaic.step(cfa))
-    return _Correlations(
-        tuple(c.id for c in captures[:MOST_FRAMES]), lit, held_out, pixel_dn2, value, freedom, float(np.mean(parts))
-    )
+    return _Correlations(tuple(c.id for c in captures), lit, held_out, pixel_dn2, value, freedom, float(np.mean(parts)))
 
 
+@lru_cache(maxsize=4)
 def _expected(rows: int, cols: int, period: int) -> FloatArray:
     """Correlation of independent pixels after the means of rows and columns were taken out of each plane: -1 / (n - 1)
-    of two in one row, or one column, of n of a plane; 1 / (n - 1) (m - 1) of others of a plane."""
-    row, col = np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij")
+    of two in one row, or one column, of n of a plane; 1 / (n - 1) (m - 1) of others of a plane.
+
+    Rows and columns of two related pixels don't depend on each other: shares of pairs are products."""
+    row = np.broadcast_to(np.arange(rows, dtype=np.int32)[:, None], (rows, cols))
+    col = np.broadcast_to(np.arange(cols, dtype=np.int32), (rows, cols))
+    n, m = cols / period - 1.0, rows / period - 1.0
     found = []
     for one in RELATIONS.values():
-        (row_a, row_b), (col_a, col_b) = one(row), one(col)
-        alike = (row_a % period == row_b % period) & (col_a % period == col_b % period)
-        in_row, in_column = row_a == row_b, col_a == col_b
-        n, m = cols / period - 1.0, rows / period - 1.0
-        each = np.where(in_row, -1.0 / n, np.where(in_column, -1.0 / m, 1.0 / (n * m)))
-        found.append(float(np.mean(np.where(alike, each, 0.0))))
+        (in_row, other_row), (in_column, other_column) = (_shares(*one(index), period) for index in (row, col))
+        in_one_row = -in_row * (in_column + other_column) / n
+        found.append(in_one_row - other_row * in_column / m + other_row * other_column / (n * m))
     return np.array(found)
+
+
+def _shares(first: Frame, second: Frame, period: int) -> tuple[float, float]:
+    """Return the shares of the pairs whose index along one axis is the same, and another of the same plane."""
+    apart = first - second
+    same = float(np.mean(apart == 0))
+    return same, float(np.mean(apart % period == 0)) - same
 
 
 def _coupled(laws: Sequence[CoupledAmplifiers]) -> FloatArray:

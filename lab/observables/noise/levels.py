@@ -144,6 +144,15 @@ class RecordedLevels:
         """Variance, DN^2, below which rounding to the step of the codes hides the noise."""
         return HIDDEN_DN2 * self.step_dn**2
 
+    def pixel_variance_dn2(self, level: MeasuredLevel, name: str) -> float:
+        """Return the temporal variance of single pixels of a plane, DN^2: of a flat, without what the pixels of a row
+        share beyond dark frames, as they do in a light that flickers while the rows are exposed."""
+        own = level.plane[name]
+        if level.lamp == "dark":
+            return own.temporal_variance
+        dark = [one.plane[name].row_variance for one in self.darks if one.repeats > 1]
+        return own.temporal_variance - own.row_variance + (float(np.mean(dark)) if dark else 0.0)
+
     @classmethod
     def of(
         cls,

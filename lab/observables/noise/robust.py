@@ -13,6 +13,7 @@ Image = NDArray[np.float32]
 
 CLIP = 4.5  # standard deviations at which pixels are clipped in robust statistics
 SIGNIFICANT = 3.0  # standard deviations from which on a spread isn't that by derived noise
+BLOCK_ROWS = 64  # of frames that are compared with each other
 MEDIAN_OF = 5  # most frames whose median shows defective pixels
 SMOOTH_PX, LOCAL_PX = 9, 33  # sides of the boxes for the local mean and the local variance of a pixel's surroundings
 
@@ -20,8 +21,12 @@ SMOOTH_PX, LOCAL_PX = 9, 33  # sides of the boxes for the local mean and the loc
 def from_surroundings(frames: list[Image], step_dn: float = 1.0) -> tuple[Image, Image]:
     """Departures (rows, cols) of the pixels of the frames' lower median from their local mean, without the means of
     rows and columns; and their local standard deviation, DN. `step_dn`: step of the codes."""
-    level = [f - row_means(f, step_dn)[:, None] for f in frames]
-    median: Image = np.sort(np.array(level), axis=0)[(len(frames) - 1) // 2]
+    means = [row_means(f, step_dn)[:, None] for f in frames]
+    median: Image = np.empty(frames[0].shape, np.float32)
+    for start in range(0, len(median), BLOCK_ROWS):
+        rows = slice(start, start + BLOCK_ROWS)
+        level = np.array([f[rows] - mean[rows] for f, mean in zip(frames, means, strict=True)])
+        median[rows] = np.partition(level, (len(frames) - 1) // 2, axis=0)[(len(frames) - 1) // 2]
 
     std = robust_std(median, step_dn)
     flat, _ = without_lines(median, np.clip(median, -CLIP * std, CLIP * std))

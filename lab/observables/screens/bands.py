@@ -17,7 +17,7 @@ the same coefficients.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lab.observables.screens.canvas import LAST_BAND_CY_PER_PX, Canvas, from_middle, mask_points, pixels_of
+from lab.observables.screens.canvas import LAST_BAND_CY_PER_PX, BeyondPart, Canvas, from_middle, mask_points, pixels_of
 from lab.observables.screens.placement import ReferenceTransfer, place_slopes
 from lab.observables.screens.registration import ScreenWarp
 from sim.spectrum import FloatArray
@@ -176,6 +176,12 @@ class PlacedPattern:
     def beyond(self) -> list[FloatArray]:
         """Return the parts of the pattern beyond the bands, as drawn for the reference pixels."""
         return self.canvas.beyond(SHARP.with_aperture)
+
+    @cached_property
+    def beyond_parts(self) -> list[BeyondPart]:
+        """Return what changes of the OTF beyond the bands change, as drawn for the reference pixels; pictures in single
+        precision, as they are many."""
+        return [replace(p, picture=np.asarray(p.picture, np.float32)) for p in self.canvas.beyond_parts()]
 
     @cached_property
     def halves(self) -> list[NDArray[np.bool_]]:

@@ -6,7 +6,7 @@ blurs it, and it is sampled at the pixels as the image is, so that both are alia
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -214,32 +214,28 @@ class Canvas:
                     found.append(self._aliased(part, above.rows))
         return found
 
-    @cached_property
-    def beyond_parts(self) -> list[BeyondPart]:
-        """Return what changes of the OTF beyond the bands change, by their nodes."""
+    def beyond_parts(self) -> Iterator[BeyondPart]:
+        """Yield what changes of the OTF beyond the bands change, by their nodes."""
         fy, fx = self.frequencies
         corner, radius = self._corner(beyond_reference), np.hypot(fx, fy)
-        found = []
         for side, flat in ((fx >= np.abs(fy), True), (fx < np.abs(fy), False)):
             power = np.where(side, np.abs(corner) ** 2, 0.0)
             lesser = np.arctan2(np.minimum(fx, np.abs(fy)), np.maximum(fx, np.abs(fy)))
             angle = float(np.average(lesser, weights=power))
-            for node, weight in zip(CORNER_NODES_CY_PER_PX, _splines(radius, CORNER_NODES_CY_PER_PX), strict=True):
+            for node, weight in _splines(radius, CORNER_NODES_CY_PER_PX):
                 x, y = node * np.cos(angle), node * np.sin(angle)
                 x, y = (x, y) if flat else (y, x)
-                found.append(BeyondPart(self.picture(np.where(side, weight * corner, 0.0)), (x, x), (y, -y)))
+                yield BeyondPart(self.picture(np.where(side, weight * corner, 0.0)), (x, x), (y, -y))
         above = self._above(beyond_reference)
         lesser = np.minimum(above.fx, np.abs(above.fy))
         outside = np.where(above.largest >= LAST_BAND_CY_PER_PX, above.spectrum, 0.0)
-        along = _splines(above.largest, RING_NODES_CY_PER_PX)
-        across = _splines(lesser, LESSER_NODES_CY_PER_PX, even=True)
-        for side, flat in zip(above.sides, (True, False), strict=True):
-            for larger, weight in zip(RING_NODES_CY_PER_PX, along, strict=True):
-                part = np.where(side, weight * outside, 0.0)
-                for smaller, share in zip(LESSER_NODES_CY_PER_PX, across, strict=True):
+        across = list(_splines(lesser, LESSER_NODES_CY_PER_PX, even=True))
+        for larger, weight in _splines(above.largest, RING_NODES_CY_PER_PX):
+            for side, flat in zip(above.sides, (True, False), strict=True):
+                part: NDArray[np.complex128] = np.where(side, weight * outside, 0.0)
+                for smaller, share in across:
                     x, y = (larger, smaller) if flat else (smaller, larger)
-                    found.append(BeyondPart(self._aliased(part * share, above.rows), (x, x), (y, -y)))
-        return found
+                    yield BeyondPart(self._aliased(np.asarray(part * share, complex), above.rows), (x, x), (y, -y))
 
     def _corner(self, transfer: Transfer) -> NDArray[np.complex128]:
         """Return the spectrum behind a transfer function at the frequencies below 0.5 cy/px that no band has."""
@@ -301,12 +297,13 @@ class _Above:
         return self.fx >= np.abs(self.fy), self.fx < np.abs(self.fy)
 
 
-def _splines(value: FloatArray, nodes: Sequence[float], *, even: bool = False) -> FloatArray:
-    """Return the weights (nodes, *value) by which a cubic spline through values at `nodes` takes each of them, constant
-    beyond the last node. `even`: its slope at the first node is 0."""
-    ends = ((1, np.zeros(len(nodes))) if even else "not-a-knot", "not-a-knot")
-    weights = CubicSpline(nodes, np.eye(len(nodes)), bc_type=ends)(np.clip(value, nodes[0], nodes[-1]))
-    return np.asarray(np.moveaxis(weights, -1, 0))
+def _splines(value: FloatArray, nodes: Sequence[float], *, even: bool = False) -> Iterator[tuple[float, FloatArray]]:
+    """Yield each node with the weight by which a cubic spline through values at `nodes` takes its own at `value`,
+    constant beyond the last node. `even`: the spline's slope at the first node is 0."""
+    ends = ((1, 0.0) if even else "not-a-knot", "not-a-knot")
+    at = np.clip(value, nodes[0], nodes[-1])
+    for node, own in zip(nodes, np.eye(len(nodes)), strict=True):
+        yield node, np.asarray(CubicSpline(nodes, own, bc_type=ends)(at))
 
 
 def pixels_of(canvas: Canvas, seen: FloatArray, places: Sequence[tuple[int, int]], step: int) -> NDArray[np.bool_]:

@@ -29,8 +29,6 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import Uniform
 
-# share of the lit screen's level: light of lit parts that the model doesn't follow, and of the screen's surroundings
-SCREEN_FLOOR = 6e-4
 RADII, ANGLES = 24, 4  # nodes of frequency and orientation between which a transfer function is interpolated
 FINE_CY_PER_PX = 0.01  # frequency below which the nodes are evenly spaced
 
@@ -85,13 +83,14 @@ def measure_screen(dataset: Dataset) -> Observable:
     ids = [p.kind for p in points]
     same = np.array([[a == b for b in ids] for a in ids])
     white = np.array([p.white for p in points])
-    channel, digits = np.array([p.channel for p in points]), np.array([p.digits for p in points])
+    channel = np.array([p.channel for p in points])
+    # seen and held-out repeats have the dark screen's frames, and their rounding, in common
+    fixed = np.array([np.hypot(p.digits, p.black_std) for p in points])
     covariance += (
         same * np.outer(tail, tail) * dataset.tail_std**2
         + np.outer(beyond, beyond)
-        + np.outer(white, white) * SCREEN_FLOOR**2
         + np.diag(np.square(1e-4 * white))
-        + same * (channel[:, None] == channel) * np.outer(digits, digits)
+        + same * (channel[:, None] == channel) * np.outer(fixed, fixed)
     )
 
     def predict(effects: Effects) -> Prediction:
@@ -169,7 +168,8 @@ class _DarkSquares:
     captures: tuple[str, ...]
     held_out: bool
     value: float  # mean level less that of the dark screen
-    std: float  # of `value` by shot and read noise
+    std: float  # of `value` by shot and read noise of the pattern's repeats
+    black_std: float  # the same by that of the dark screen's
     tail: float  # predicted level by the baseline's point spread function
     picture: FloatArray  # pattern less dark screen, one plane of the mosaic
     use: NDArray[np.bool_]  # mask of the dark squares' pixels in it
@@ -243,11 +243,11 @@ def _dark_squares(
         added = (shown - black)[plane]
         difference = added[use]
         lights = np.maximum([float(frame[plane][use].mean()) - noise.black for frame in (shown, black)], 0.0)
-        variance = (noise.gain * lights[1] + noise.read_dn**2) * (1 / len(part) + 1 / blacks)
+        variances = (noise.gain * lights + noise.read_dn**2) / np.array([len(part), blacks]) / use.sum()
         means = [float(channel_pixels(f, dataset.camera.cfa, channel).mean()) for f in (shown, black)]
         found.append(
             _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
-                         float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),
+                         float(np.sqrt(variances[0])), float(np.sqrt(variances[1])), 0.5 * float(ends + endless),
                          added, use, Surroundings.of(harmonics(added), use), reach, 0.5 * float(endless - ends),
                          means[0] - means[1], float(full[bright].mean()),
                          float(black[plane][use].mean()) - noise.black,

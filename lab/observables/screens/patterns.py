@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -212,13 +213,14 @@ class _Baseline:
         fy, fx = canvas.frequencies
         inside = np.hypot(fx, fy) < RINGS_CY_PER_PX[-1]
         powers = even_powers(fx, fy, EVEN_ORDER, RINGS_CY_PER_PX[-1])
-        pieces = [
-            *(canvas.picture(np.where(inside, term * spectrum, 0.0))[mask] for term in powers),
-            *(canvas.picture(np.where(half, spectrum, 0.0))[mask] for half in placed.halves),
-            *placed.odd_pieces(canvas, spectrum, mask),
-            *(gain * part.picture[mask] for part in canvas.beyond_parts),
-        ]
-        at = placed.canvas.beyond_parts
+        parts = placed.beyond_parts if canvas is placed.canvas else canvas.beyond_parts()
+        pieces = chain(
+            (canvas.picture(np.where(inside, term * spectrum, 0.0))[mask] for term in powers),
+            (canvas.picture(np.where(half, spectrum, 0.0))[mask] for half in placed.halves),
+            placed.odd_pieces(canvas, spectrum, mask),
+            (gain * part.picture[mask] for part in parts),
+        )
+        at = placed.beyond_parts
 
         @lru_cache(maxsize=8)
         def changed(showing: tuple[Effect, ...]) -> FloatArray:
@@ -233,7 +235,7 @@ class _Baseline:
 
         return _Baseline(
             coefficients=design.coefficients(image),
-            mix=design.weights[: design.bands] @ np.array(pieces).T,
+            mix=np.column_stack([design.weights[: design.bands] @ piece for piece in pieces]),
             beyond=np.array([part.fx + part.fy for part in at]).reshape(len(at), 2, 2),
             shown_by=shown_by,
         )

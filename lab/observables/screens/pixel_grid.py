@@ -23,7 +23,8 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
 CERTAIN = 8.0  # standard deviations beyond which strength is stated on a logarithmic scale
-GRID_STD = 1.3  # of the strongest line's normal quantile; above 1, as the noise's mean is measured
+#: Independent frequencies, of all that a window of Hann has.
+INDEPENDENT = 0.6
 GRID_DETREND_PX = 8.0  # standard deviation of the Gaussian by which shading is removed
 GRID_LOWEST = 0.12  # cycles a sample below which shading remains
 GRID_LARGEST = 512  # largest side of the box, samples
@@ -40,6 +41,7 @@ class _Line:
     power: float  # over the noise's mean
     per_amplitude: float  # power over the noise's mean of a grid of amplitude 1
     places: int  # effective number of independent frequencies
+    noise_std: float  # relative standard deviation of the noise's mean about the line
 
     def normal(self, power: float) -> float:
         """Standard normal quantile of the probability that the largest of `places` exponential variables of mean 1 is
@@ -48,6 +50,12 @@ class _Line:
         normal = float(np.sqrt(-2.0 * rare)) if rare < -600.0 else -float(special.ndtri(-np.expm1(-np.exp(rare))))
         # only the order of magnitude matters there
         return normal if normal < CERTAIN else CERTAIN * (1.0 + float(np.log(normal / CERTAIN)))
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of the quantile: 1, and by the error of the noise's mean, which is measured."""
+        low, high = (self.normal(self.power * float(np.exp(sign * self.noise_std))) for sign in (-1.0, 1.0))
+        return float(np.hypot(1.0, 0.5 * (high - low)))
 
 
 def measure_screen_grid(dataset: Dataset) -> Observable:
@@ -84,7 +92,8 @@ def measure_screen_grid(dataset: Dataset) -> Observable:
 
     return Observable(
         measurement=SCREEN_GRID, reach=1e9,
-        value=np.array([line.normal(line.power) for line in found]), covariance=GRID_STD**2 * np.eye(len(found)),
+        value=np.array([line.normal(line.power) for line in found]),
+        covariance=np.diag([line.std**2 for line in found]),
         labels=tuple(Label(line.cycles_per_px, line.channel, "lit screen", line.captures, False) for line in found),
         reads=SHOWN, predict=predict, scale=np.ones(len(found)),
     )  # fmt: skip
@@ -104,13 +113,13 @@ def _line(dataset: Dataset, group: Sequence[Any], channel: str) -> _Line:
     dark = np.median(mean_frame(dataset.recordings, blacks)) if blacks else dataset.noise.black
     bright = plane > 0.5 * (np.quantile(plane, 0.98) + dark)
     box = _box(bright)
-    power, noise, window = _power(plane[box], step)
+    power, noise, noise_std, window = _power(plane[box], step)
     fy, fx = fft.fftfreq(window.shape[0])[:, None], fft.rfftfreq(window.shape[1])[None, :]
     count = (fx > 2.5 / window.shape[1]) & (np.abs(fy) > 2.5 / window.shape[0]) & (np.hypot(fx, fy) > GRID_LOWEST)
     flats = dataset.flat_levels()
     if flats:
         lit = mean_frame(dataset.recordings, flats[len(flats) // 2])[row::step, col::step]
-        of_flats, level, _ = _power(lit[box], step)
+        of_flats, level, *_ = _power(lit[box], step)
         count &= ndimage.maximum_filter(of_flats / level, 3) < GRID_OF_CAMERA
     relative = np.where(count, power / noise, 0.0)
     i, j = np.unravel_index(int(np.argmax(relative)), relative.shape)
@@ -119,7 +128,7 @@ def _line(dataset: Dataset, group: Sequence[Any], channel: str) -> _Line:
     unit = (0.25 * share * window.sum()) ** 2 / noise[i, j]
     return _Line(
         channel, tuple(c.id for c in group), float(np.hypot(fy[i, 0], fx[0, j])) / step, float(relative[i, j]),
-        float(unit), int(0.6 * count.sum())
+        float(unit), int(INDEPENDENT * count.sum()), float(noise_std[i, j])
     )  # fmt: skip
 
 
@@ -138,9 +147,12 @@ def _box(bright: NDArray[np.bool_]) -> tuple[slice, slice]:
     return box
 
 
-def _power(plane: FloatArray, step: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Power spectrum of a plane over its smooth part less 1, the mean power of noise at every frequency, and the window
-    (Hann)."""
+def _power(plane: FloatArray, step: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Power spectrum of a plane over its smooth part less 1, the mean power of noise at every frequency, its relative
+    standard deviation, and the window (Hann).
+
+    The mean is the median of a ring of frequencies over ln 2, that of an exponential distribution: of m independent
+    ones its relative standard deviation is 1 / (ln 2 sqrt(m))."""
     smooth = ndimage.gaussian_filter(plane, GRID_DETREND_PX / step, mode="nearest")
     window = np.outer(np.hanning(plane.shape[0]), np.hanning(plane.shape[1]))
     relative = plane / np.maximum(smooth, 1e-12) - 1.0
@@ -149,11 +161,12 @@ def _power(plane: FloatArray, step: int) -> tuple[FloatArray, FloatArray, FloatA
     power = np.abs(fft.rfft2(relative * window)) ** 2
     fy, fx = fft.fftfreq(plane.shape[0])[:, None], fft.rfftfreq(plane.shape[1])[None, :]
     ring = np.minimum((np.hypot(fy, fx) * 20.0).astype(int), 13)
-    noise = np.ones_like(power)
+    noise, std = np.ones_like(power), np.zeros_like(power)
     for k in range(14):
         if np.any(ring == k):
             noise[ring == k] = np.median(power[ring == k]) / np.log(2.0)
-    return power, np.maximum(noise, 1e-300), window
+            std[ring == k] = 1.0 / (np.log(2.0) * np.sqrt(INDEPENDENT * np.sum(ring == k)))
+    return power, np.maximum(noise, 1e-300), std, window
 
 
 SCREEN_GRID = Measurement(

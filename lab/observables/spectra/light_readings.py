@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from lab.observables.flats.linearity import RADIOMETER_STD
 from sim.spectrum import FloatArray, Spectrum
 
+#: Relative standard deviation of a radiometer's reading as a whole, common to the channels: the repeatability of a
+#: spectroradiometer. The most that narrowband readings may have.
+RADIOMETER_STD = 0.002
 READING_SAMPLE_STD = 1e-3  # of a sample of a radiometer's reading, where no wavelength was read twice
 MOST_SAMPLE_STD = 4e-3  # the most that is measured of it
 READING_STD = 1e-4  # the least of a reading, common to the channels

@@ -19,9 +19,6 @@ from sim.effects.base import Effects
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import LEVEL, SPECTRAL
 
-# Relative standard deviations.
-NARROWBAND_FLOOR = 1e-4  # of a level, independent between channels, common to its repeats
-
 
 def measure_narrowband(dataset: Dataset) -> Observable:
     """Mean of every unclipped narrowband frame by channel, DN, against the maker's sensitivity curves.
@@ -93,7 +90,7 @@ def measure_narrowband(dataset: Dataset) -> Observable:
 def _narrowband_covariance(
     dataset: Dataset, points: list[tuple[Any, str, float, bool]], signal: FloatArray, curves: CurveJacobian
 ) -> FloatArray:
-    """Covariance (n, n) of narrowband means, DN^2: shot and read noise, floor and rounding (common to repeats), the
+    """Covariance (n, n) of narrowband means, DN^2: shot and read noise, rounding (common to repeats), the
     radiometer's readings, and the lamp's repeatability (common to a frame's channels)."""
     noise = dataset.noise
     exposures = np.array([c.exposure_s for c, *_ in points])
@@ -104,7 +101,7 @@ def _narrowband_covariance(
     setting = np.array([f"{c.wavelength_nm} {c.exposure_s} {channel}" for c, channel, *_ in points])
     reading = np.array([c.radiance for c, *_ in points])
     digits = noise.rounding_std_dn(signal)
-    own = np.sqrt((NARROWBAND_FLOOR * signal) ** 2 + rounded**2 + digits**2)
+    own = np.sqrt(rounded**2 + digits**2)
     expected = curves.rates(()) * exposures
     radiometer = signal * reading_std(points, signal, shot, expected)
     covariance = np.diag(shot) + (setting[:, None] == setting) * np.outer(own, own)

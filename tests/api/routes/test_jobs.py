@@ -67,6 +67,27 @@ def submit(client: httpx.Client, running: Running, kind: str) -> dict[str, Any]:
     return job
 
 
+def test_a_job_diagnoses_by_the_engine_that_is_asked_for(
+    shared: Running, quick_steps: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def examine(*_: object, **more: object) -> Diagnosis:
+        asked.append(more["engine"])
+        return Diagnosis(DiagnosisResult(source="x", verdict="no_mismatch"), {})
+
+    monkeypatch.setattr(lab.diagnose, "examine", examine)
+    session_id = shared.store.sessions()[0].id
+    with shared.client("calibrate") as client:
+        for more in ({}, {"engine": "evidence"}):
+            job = client.post(f"/api/v1/sessions/{session_id}/jobs", json={"kind": "diagnose", **more}).json()
+            until(client, f"/api/v1/jobs/{job['id']}", lambda now: now["state"] == "done")
+        refused = client.post(f"/api/v1/sessions/{session_id}/jobs", json={"kind": "fit", "engine": "evidence"})
+    assert asked == ["today", "evidence"]
+    assert refused.status_code == 422, refused.text
+    assert "a job of the kind fit makes no diagnosis" in refused.text
+
+
 def test_a_result_is_what_the_command_line_writes(shared: Running, with_task: Callable[..., None]) -> None:
     with_task(lambda tell: FIT)
     with shared.client("calibrate") as client:

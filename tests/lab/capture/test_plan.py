@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from lab.capture.plan import CapturePlan, full_plan
+from lab.capture.plan import EMVA_LEVELS, STACK_IMAGES, STANDARDS_SEQUENCES, CapturePlan, full_plan, standards_plan
 from lab.capture_kinds.base import SEQUENCES, FindExposure, RelativeExposure, Setting, Step
 from lab.capture_kinds.dark import DarkSequence
 from lab.capture_kinds.flat import FlatSequence
@@ -32,6 +32,31 @@ def test_a_full_calibration_takes_what_the_fits_need(quick: bool) -> None:
     assert len(edges) >= 4 * 2  # orientations x repeats
     assert set(edges.values()) == {3}  # regions
     assert kinds["charuco"] == 3
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_the_standards_get_the_levels_and_stacks_that_they_ask_for(quick: bool) -> None:
+    """EMVA 1288: 50 levels up to saturation and stacks of 16; ISO 18844: the chart and the dark screen."""
+    assert set(STANDARDS_SEQUENCES) < SEQUENCES.keys()
+    plan = standards_plan(STATION, quick)
+    assert set(plan.names) == {*STANDARDS_SEQUENCES, "flare"}
+    flats = next(one for one in plan.sequences if isinstance(one, FlatSequence))
+    darks = next(one for one in plan.sequences if isinstance(one, DarkSequence))
+    assert quick or len(set(flats.levels)) >= EMVA_LEVELS
+    assert max(flats.levels) > 1.5
+    assert flats.levels.count(0.5) * flats.frames >= STACK_IMAGES
+    assert darks.frames >= STACK_IMAGES
+    steps = plan.steps(STATION)
+    shown = Counter(c.lit for step in steps for c in step.captures if c.kind == "flare" and c.side == "left")
+    assert shown[True] == shown[False] >= 2
+    assert "flare" not in full_plan(STATION, quick).names
+
+
+def test_the_flare_chart_is_white_with_a_black_square_in_its_middle() -> None:
+    (cells,) = (c for path, c in standards_plan(STATION).patterns(STATION).items() if path == "targets/flare.npy")
+    black = np.argwhere(cells == 0)
+    assert 0 < len(black) < 0.05 * cells.size
+    np.testing.assert_allclose(black.mean(axis=0), 0.5 * np.array(cells.shape) - 0.5)
 
 
 @pytest.mark.parametrize("quick", [False, True])
@@ -79,6 +104,18 @@ def test_ladders_cancel_a_linear_drift() -> None:
     assert [step.id for step in steps] == [
         "dark/0.01s/1", "dark/1s/1", "dark/2s/1", "dark/2s/2", "dark/1s/2", "dark/0.01s/2",
     ]  # fmt: skip
+
+
+def test_flats_are_taken_at_every_gain() -> None:
+    """Each gain has steps of its own, which have the gain; without one it is the station's, and none is stated."""
+    one, two = (FlatSequence(levels=(0.2, 0.6), frames=2, gains_db=gains) for gains in ((), (6.0, 20.0)))
+    steps = two.steps(STATION)
+    assert steps[: len(one.steps(STATION))] == one.steps(STATION)
+    assert [s.setting.gain_db for s in steps if isinstance(s.exposure, FindExposure)] == [None, 6.0, 20.0]
+    assert {s.id.split("/")[1] for s in steps if s.setting.gain_db is not None} == {"6dB", "20dB"}
+    with pytest.raises(InputError, match=r"flat.gains_db: .*90.0 dB is above the upper limit 80.0 dB"):
+        full_plan(STATION, only=("flat",), parameters={"flat": {"gains_db": [90.0]}})
+    CapturePlan((two,)).steps(STATION)
 
 
 def test_flats_go_from_near_dark_to_beyond_saturation() -> None:

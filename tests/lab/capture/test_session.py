@@ -14,8 +14,10 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
+import numpy as np
 import pytest
 
 from drivers.camera.base import SensorInfo
@@ -91,6 +93,50 @@ def test_a_whole_calibration(store: Store) -> None:
     recordings = store.recording_set(session.id)
     assert {c.bandwidth_nm for c in recordings.captures("narrowband")} == {9.48}
     assert all(c.temperature_c == 25.0 and c.time is not None for c in recordings.captures())
+
+
+def test_flats_at_two_gains_have_exposures_of_their_own(store: Store) -> None:
+    """At 12 dB, a factor 4, the same share of saturation takes a quarter of the exposure, within the searches'
+    tolerance of 0.05 of 0.75 on either; the signal a second is four times as large."""
+    two = CapturePlan((FlatSequence(levels=(0.2, 0.5), frames=2, gains_db=(12.0,)),))
+    session = begin(store, Bench(), two)
+    session.run()
+    assert_whole(store, session.id)
+    recordings = store.recording_set(session.id)
+    for side in recordings.sides:
+        flats = recordings.captures("flat", side)
+        assert Counter(c.gain_db for c in flats) == {0.0: 4, 12.0: 4}
+        exposure_s = {db: fmean(c.exposure_s for c in flats if c.gain_db == db) for db in (0.0, 12.0)}
+        rate = {
+            db: fmean((recordings.frame(c).mean() - BLACK) / c.exposure_s for c in flats if c.gain_db == db)
+            for db in (0.0, 12.0)
+        }
+        factor = 10.0 ** (12.0 / 20.0)
+        assert exposure_s[0.0] / exposure_s[12.0] == pytest.approx(factor, rel=2.0 * 0.05 / 0.75)
+        # means of 4 frames of 2 DN noise, truncated by half a DN of some 500
+        assert rate[12.0] / rate[0.0] == pytest.approx(factor, rel=0.01)
+
+
+def test_dark_frames_follow_bright_flats_with_the_shutter_closed(store: Store) -> None:
+    """The three flats before them have 0.9 of saturation, within the search's tolerance of 0.05 of 0.75; the darks have
+    the black level, within 4 standard deviations of the mean of the frame's pixels of 2 DN and the half DN of
+    truncation."""
+    plan = CapturePlan((FlatSequence(levels=(0.2, 0.5), frames=1, darks_after=4, dark_after_s=0.5),))
+    bench = Bench()
+    session = begin(store, bench, plan)
+    session.run()
+    assert_whole(store, session.id)
+    assert_safe(bench)
+    recordings = store.recording_set(session.id)
+    for side in recordings.sides:
+        last = sorted(recordings.captures(side=side), key=lambda c: c.time)[-7:]
+        assert [c.kind for c in last] == ["flat"] * 3 + ["dark"] * 4
+        assert {c.exposure_s for c in last[3:]} == {0.5}
+        means = [float(recordings.frame(c).mean()) - BLACK for c in last]
+        levels = [float(recordings.frame(c).mean()) - BLACK for c in recordings.captures("flat", side)[:2]]
+        assert means[0] / levels[1] == pytest.approx(0.9 / 0.5, rel=0.02)
+        pixels = recordings.frame(last[-1]).size
+        assert means[3:] == pytest.approx([-0.5] * 4, abs=4.0 * 2.1 / np.sqrt(pixels))
 
 
 def test_a_session_has_a_snapshot_of_its_instruments_and_says_what_changed(store: Store, tmp_path: Path) -> None:

@@ -188,8 +188,8 @@ def test_every_kind_declares_what_others_ask() -> None:
         assert kind.shows
         assert kind.sequence is None or SEQUENCES[kind.sequence.name] is kind.sequence, name
     steps = full_plan(fake_bench.station()).steps(fake_bench.station())
-    # a full session leaves the lenses' aperture rings alone
-    assert {c.kind for step in steps for c in step.captures} == set(CAPTURES.names) - {"stopped_edge"}
+    # a full session leaves the lenses' aperture rings alone; only `standards_plan` shows the flare chart
+    assert {c.kind for step in steps for c in step.captures} == set(CAPTURES.names) - {"stopped_edge", "flare"}
     for target in fake_bench.station().targets.values():
         assert target.instruction
 

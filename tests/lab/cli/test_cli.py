@@ -318,6 +318,27 @@ def test_a_diagnosis_that_judged_nothing_ends_with_2(
     assert "Add dark frames." in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("options", "engine"), [([], "today"), (["--engine", "evidence"], "evidence")])
+def test_the_engine_that_is_asked_for_diagnoses(
+    flats: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], engine: str
+) -> None:
+    asked = []
+
+    def examine(*_: object, **more: object) -> Diagnosis:
+        asked.append(more["engine"])
+        assert callable(more["refit"])
+        return Diagnosis(DiagnosisResult(source="x", verdict="no_mismatch"), {})
+
+    monkeypatch.setattr(lab.diagnose, "examine", examine)
+    assert cli.main(["diagnose", str(flats), *options]) == 0
+    assert asked == [engine]
+
+
+def test_the_table_of_sets_draws_no_threshold(flats: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["diagnose", str(flats), "--engine", "evidence", "--bootstrap", "10"]) == 2
+    assert "--bootstrap: the engine evidence has no threshold" in capsys.readouterr().err
+
+
 def test_a_departing_measurement_is_told_with_its_held_out_chi2(
     flats: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,7 @@ from evaluation.independent_simulator import ConcealedCamera, Plan
 from lab.diagnose.inference.held_out import held_out_mismatches
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.outlying import freed, outlying_levels
-from lab.diagnose.outcome.improved_model import Correction
+from lab.diagnose.outcome.corrections import Correction
 from lab.diagnose.outcome.mismatches import located, unexplained
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import RecordingSet

@@ -12,7 +12,7 @@ from scipy.special import logit
 from scipy.stats import chi2, norm
 
 from lab.diagnose import DecisionPolicy, diagnose, examine
-from lab.diagnose.outcome.goodness_of_fit import detectable
+from lab.diagnose.outcome.detectability import detectable
 from tests.lab.diagnose.on_blocks import former
 
 DOCS = Path(__file__).parents[3] / "docs"

@@ -26,11 +26,12 @@ from lab.observables.codes.rounding import rounding_std_dn
 from lab.observables.darks.frames import cell_means
 from lab.observables.darks.level import added_dark_dn, dark_current_map
 from lab.observables.flats.field import measure_flat_field
-from lab.observables.flats.linearity import RADIOMETER_STD, measure_photon_transfer
+from lab.observables.flats.linearity import measure_photon_transfer
 from lab.observables.gaussian import chi2
 from lab.observables.noise.repeatability import level_repeatability, repeated_levels
 from lab.observables.spectra.light_readings import (
     MOST_SAMPLE_STD,
+    RADIOMETER_STD,
     READING_SAMPLE_STD,
     READING_STD,
     reading_std,

@@ -23,6 +23,7 @@ from lab.formats.results import (
     EffectSet,
     FitResult,
     MakerDeparture,
+    ParameterValue,
     PatchComparison,
     PolicyRule,
     ResidualCurve,
@@ -31,6 +32,7 @@ from lab.formats.results import (
     SideModels,
     SpectralFit,
     Unexplained,
+    Unlisted,
     ValidationResult,
 )
 from lab.predict.validate import BothModels, SensitivityCurve
@@ -579,3 +581,46 @@ def test_the_odds_hold_all_models_and_add_up(made_up: MadeUp) -> None:
     assert rows[0] == ("optical low-pass filter, none further", 0.9) and rows[1] == ("no effect: the baseline", 0.04)
     assert sum(probability for label, probability in rows if not label.startswith("rival")) == pytest.approx(1.0)
     assert rows[-1] == ("rival of optical low-pass filter: defocus", 0.006)
+
+
+def test_a_table_of_sets_is_shown_with_what_is_unlisted(
+    small_set: Callable[..., RecordingSet], made_up: MadeUp
+) -> None:
+    """By the engine `evidence`: no condition on listed causes, unlisted physics beside each set and by itself, rivals
+    among the sets, and a size that isn't determined told so."""
+    recordings, (fit, validation, diagnosis) = small_set(), made_up()
+    sets = (
+        EffectSet(effects=("optical_low_pass_filter",), probability=0.6),
+        EffectSet(effects=("optical_low_pass_filter",), probability=0.38, unlisted=("transfer",)),
+    )
+    models = SideModels(side="left", share=0.95, sets=sets, inclusion=(), never_refitted=0.004)
+    size = ParameterValue(value=2.0, std=1.5, unit="um", interval=(0.0, 5.5), is_determined=False)
+    told = diagnosis.effects[0].model_copy(update={"parameters": {"displacement_x_um": size}})
+    unlisted = Unlisted(
+        side="left", state="transfer", measurements=("slanted_edge",), probability=0.61, where="0.2..0.4 cy/px"
+    )  # fmt: skip
+    by_table = diagnosis.model_copy(
+        update={"engine": "evidence", "models": (models,), "unlisted": (unlisted,), "effects": (told,)}
+    )
+    text = Page(render_report(recordings, fit, validation, by_table, provenance_of(recordings))).text
+    assert "If every cause is a listed effect" not in text
+    assert "Posterior probabilities; unlisted physics is among them." in text
+    assert "optical low-pass filter + unlisted physics of the transfer, none further" in text
+    assert "Unlisted physics acts on the transfer of the left camera: probability 0.61." in text
+    assert "Left: 0.4 % of the probability belongs to sets that were not refitted." in text
+    assert "2 (0 to 5.5) µm, not determined" in text
+    none = SideModels(side="left", share=0.95, sets=(EffectSet(effects=(), probability=0.961),), inclusion=())
+    clean = by_table.model_copy(update={"verdict": "no_mismatch", "models": (none,), "effects": (), "unlisted": ()})
+    clean_text = Page(render_report(recordings, fit, validation, clean, provenance_of(recordings))).text
+    assert "No effect and nothing unlisted in the left camera: probability 0.961." in clean_text
+    ((_, rows),) = odds(by_table)
+    assert sum(probability for _, probability in rows) == pytest.approx(1.0)
+
+
+def test_an_interval_is_shown_where_a_normal_distribution_has_another() -> None:
+    """Of mean 10 and standard deviation 1, 95 % lie between 8.04 and 11.96."""
+    normal = ParameterValue(value=10.0, std=1.0, unit="um", interval=(8.1, 11.9))
+    skewed = ParameterValue(value=10.0, std=1.0, unit="um", interval=(9.2, 12.9))
+    assert normal.shown_interval is None
+    assert skewed.shown_interval == (9.2, 12.9)
+    assert ParameterValue(value=10.0, std=None, unit="um", interval=(8.1, 11.9)).shown_interval == (8.1, 11.9)

@@ -17,7 +17,7 @@ from lab.diagnose.inference.refit import refit
 from lab.diagnose.inference.side_model import measurement_model
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.outcome.improved_model import improved_model
-from lab.diagnose.outcome.model_posterior import names_in_doubt
+from lab.diagnose.outcome.names_in_doubt import names_in_doubt
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import InputError
 from lab.fit import fit_recording_set

@@ -120,12 +120,81 @@ def test_a_mosaic_of_one_colour_is_a_monochrome_sensor() -> None:
     assert np.abs(optical_transfer(camera, "G", LIGHT, 0.0 * f, f, (one,))[-1]) > 0.0
 
 
+def filled_at_once(frame: FloatArray, loss: float, release_px: float) -> FloatArray:
+    """Short's model in its own words, with clouds in proportion to packets, rows read from 0 on: the traps of the n
+    transfers of a row take charge until they hold g = n loss / b of what is left, if they don't hold more already, and
+    release 1 - b of theirs into the packet."""
+    held, kept = np.exp(-1.0 / release_px), np.zeros(frame.shape[1])
+    read = np.empty(frame.shape)
+    for row, packet in enumerate(frame):
+        g = (row + 1) * loss / held
+        taken = np.maximum((g * packet - kept) / (1.0 + g), 0.0)
+        given = (1.0 - held) * (kept + taken)
+        read[row] = packet - taken + given
+        kept = held * (kept + taken)
+    return read
+
+
+@pytest.mark.parametrize("release_px", [0.6, 3.0])
+def test_all_transfers_at_once_are_shorts_model(release_px: float) -> None:
+    """Of single bright pixels exactly; of few transfers it is the law of transfer by transfer: they differ by less
+    than (n loss)^2 (1 / 2 + 1 / b) of the packet."""
+    frame = np.zeros((60, 60))
+    frame[np.arange(5, 55, 7), np.arange(5, 55, 7)] = 1000.0
+    law = Trails(0, 2e-3, ((1.0, release_px),), "first", at_once=True)
+    np.testing.assert_allclose(law.clock(frame), filled_at_once(frame, 2e-3, release_px), atol=1e-9)
+    np.testing.assert_allclose(law.kernel(20.0)[24:, 0], law.clock(np.eye(80)[:, [19]])[19:44, 0], atol=1e-6)
+    few, lost = frame.copy(), 2e-3 * 12.0
+    few[12:] = 0.0
+    plain = Trails(0, 2e-3, ((1.0, release_px),), "first")
+    np.testing.assert_allclose(
+        law.clock(few), plain.clock(few), atol=1000.0 * lost**2 * (0.5 + np.exp(1.0 / release_px))
+    )
+    assert np.abs(law.clock(frame) - plain.clock(frame)).max() > 2.0
+
+
+@pytest.mark.parametrize("mean_e", [9.0, 4000.0])
+@pytest.mark.parametrize("release_px", [0.6, 2.5])
+def test_noise_of_traps_that_packets_fill(release_px: float, mean_e: float) -> None:
+    """Variance and correlation with the next row, of the mean over all rows: N numbers, within 3 / sqrt(N) and, for
+    faint packets, the error of a law that takes what lies below b times the mean as nothing: a fifth of the share."""
+    rows, loss, columns, frames = 80, 1e-3, 400, 30
+    drawn = np.random.default_rng(5).poisson(mean_e, (rows, columns * frames)).astype(float)
+    read = filled_at_once(drawn, loss, release_px)
+    away = read - read.mean(axis=1, keepdims=True)
+    variance = float(np.mean(np.square(away)))
+    beside = float(np.mean(away[1:] * away[:-1])) / variance
+    law = ChargeTransferInefficiency(
+        parallel_ppm=1e6 * loss, release_px=release_px, noise="to the next packet", capture="all at once"
+    )
+    charge = charge_of(CAMERA.model_copy(update={"rows": rows}), (law,))
+    electrons = np.array(mean_e)
+    tolerance = 3.0 / np.sqrt(drawn.size) + (0.2 * beside if mean_e < 100.0 else 0.0)
+    assert float(charge.neighbour_correlation(electrons)[1]) == pytest.approx(beside, abs=tolerance)
+    # of a variance the mean of N squares scatters by sqrt(2 / N)
+    assert float(charge.shot_e2(electrons)) / mean_e == pytest.approx(
+        variance / mean_e, abs=np.sqrt(2.0) * tolerance + (0.2 * (1.0 - variance / mean_e) if mean_e < 100.0 else 0.0)
+    )
+
+
+def test_noise_that_lags_behind_reaches_the_second_packet() -> None:
+    """To first order in what is lost, n loss, the packet k places behind shares n loss (1 - b) b^(k - 1), and the
+    variance is less by 2 n loss. Terms of second order are (n loss)^2."""
+    lost, release = 0.01, 3.0
+    held = np.exp(-1.0 / release)
+    law = Trails(0, lost / 50.0, ((1.0, release),), "first")
+    own, first, second = law.noise(99, to_the_next=False)
+    assert own == pytest.approx(1.0 - 2.0 * lost, abs=4.0 * lost**2)
+    assert first == pytest.approx(lost * (1.0 - held), abs=4.0 * lost**2)
+    assert second == pytest.approx(lost * (1.0 - held) * held, abs=4.0 * lost**2)
+
+
 @pytest.mark.parametrize("release_px", [0.5, 3.0])
 def test_noise_goes_to_the_next_packet_alone_where_each_fills_the_traps(release_px: float) -> None:
     """Traps that each packet fills to g of its charge keep g b of it, b = exp(-1 / release), and give the rest back to
     it. The next one fills them again: N'_i = (1 - g b) N_i + g b N_(i-1), whatever the release. Over N pixels the
     covariance with the next pixel, over the variance, is g b (1 - g b) / ((1 - g b)^2 + (g b)^2) within 3 / sqrt(N);
-    the library's law is that of the frame's mean number of transfers, to first order."""
+    the library's law averages over the frame's numbers of transfers, the same to first order."""
     lost = 0.03
     g = lost / np.exp(-1.0 / release_px)
     electrons = np.random.default_rng(4).poisson(1000.0, (200, 2000)).astype(float)

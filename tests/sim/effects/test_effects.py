@@ -63,7 +63,7 @@ def test_declares_what_the_diagnosis_reads(kind: type[Effect]) -> None:
     assert kind.name == kind.__module__.rsplit(".", 1)[-1]  # one effect, one file
     # a known part of a camera, the diagnosis' own term for what has no name, and a misstated f-number
     assert kind.is_candidate == (
-        kind.name not in {"cover_glass", "empirical_law", "model_discrepancy", "other_f_number", "transfer_discrepancy"}
+        kind.name not in {"cover_glass", "empirical_law", "model_discrepancy", "other_f_number"}
     )
 
 

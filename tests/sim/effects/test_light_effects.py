@@ -8,6 +8,7 @@ import pytest
 from sim.camera import CameraModel, Lens
 from sim.effects.ambient_light import AmbientLight
 from sim.effects.base import Effect
+from sim.effects.lamp_ageing import LampAgeing
 from sim.effects.non_uniform_illumination import NonUniformIllumination
 from sim.effects.other_f_number import OtherFNumber
 from sim.effects.radiometer_nonlinearity import RIGHT_AT, RadiometerNonlinearity
@@ -72,6 +73,24 @@ def test_a_warm_up_starts_as_a_drift_and_settles() -> None:
     )
     assert Uniform(CAMERA, (steady,)).source(600.0) == pytest.approx(1.03, rel=1e-4)
     assert Uniform(CAMERA, (settling,)).source(36000.0) == pytest.approx(1 + 0.003 * 8.0)
+
+
+def test_an_aged_lamp_is_redder_by_the_stated_share_and_keeps_its_integral() -> None:
+    """Analytic limit: of equal energy, the ratio over 200 nm is exp(2 a). Conservation: the integral stays. Null limit:
+    light of one wavelength, and a screen's, are as they were."""
+    one = Uniform(CAMERA, (LampAgeing(reddening_percent=10.0),))
+    even = np.full(WAVELENGTH.shape, 0.01)
+    aged = one.radiance(WAVELENGTH, even, "flat")
+    blue, red = (int(np.argmin(np.abs(WAVELENGTH - nm))) for nm in (450.0, 650.0))
+    assert aged[red] / aged[blue] == pytest.approx(np.exp(0.1 * (WAVELENGTH[red] - WAVELENGTH[blue]) / 100.0))
+    assert np.trapezoid(aged, WAVELENGTH) == pytest.approx(np.trapezoid(even, WAVELENGTH))
+    for kind in ("narrowband", "white", "bernoulli"):
+        np.testing.assert_array_equal(one.radiance(WAVELENGTH, even, kind), even)
+    line = np.exp(-0.5 * ((WAVELENGTH - 600.0) / 4.0) ** 2)
+    # a line of 4 nm moves by a sigma^2 / 100 nm = 0.016 nm, and keeps its integral
+    moved = one.radiance(WAVELENGTH, line, "flat")
+    assert np.average(WAVELENGTH, weights=moved) - 600.0 == pytest.approx(0.016, rel=0.05)
+    np.testing.assert_array_equal(one.radiance(WAVELENGTH, 0.0 * even, "chart"), 0.0 * even)
 
 
 def test_an_unsteady_source_scatters_and_keeps_its_mean() -> None:

@@ -13,12 +13,13 @@ from lab.diagnose.inference.refit import (
     _standard_deviations,
     _wide_residual,
     _wide_slope,
-    coordinates,
     is_of_usual_size,
     profile_interval,
     refit,
+    size_covariance,
 )
 from lab.diagnose.policy import DecisionPolicy
+from lab.inference.coordinates import coordinates
 from lab.observables.observable import Label, Observable, Prediction
 from sim.effects.base import Effect
 from sim.effects.library import effect
@@ -174,3 +175,17 @@ def test_profile_intervals_cover_a_weak_blur() -> None:
         intervals.append(profile_interval(model, fit.effects, 0, "length_um", DecisionPolicy()))
     assert sum(low <= 0.1 <= high for low, high in intervals) >= 34
     assert 0 < sum(low == 0.0 for low, _ in intervals) < 40
+
+
+def test_the_covariance_of_sizes_is_that_of_their_standard_deviations() -> None:
+    """Of a member with one size, the square root of its element; of two directions of a filter, the diagonal."""
+    kind = effect("optical_low_pass_filter")
+    model = contrast_model(np.random.default_rng(5), (kind(displacement_x_um=2.0),))
+    fit = refit(model, (kind(displacement_x_um=2.0),), DecisionPolicy())
+    coords, away, covariance = size_covariance(model, fit.effects, 0)
+    assert [c.name for c in coords] == [name for name in fit.std[0] if name not in kind.shapes]
+    for c, u, variance in zip(coords, away, np.diag(covariance), strict=True):
+        value = float(getattr(fit.effects[0], c.name))
+        assert u == pytest.approx(c.to_u(value))
+        std, su = fit.std[0][c.name], np.sqrt(variance)
+        assert std == pytest.approx(min(su / max(2.0 * abs(value), 1e-12), np.sqrt(su)), rel=1e-3)

@@ -8,7 +8,7 @@ from lab.diagnose import diagnose
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.shown_in_means import is_judged_in_means, must_show_in_means, shown_in_means
 from lab.diagnose.inference.side_model import measurement_model
-from lab.diagnose.outcome.improved_model import Correction
+from lab.diagnose.outcome.corrections import Correction
 from lab.diagnose.outcome.mismatches import unexplained
 from lab.diagnose.policy import DecisionPolicy
 from lab.fit.noise.noise_fit import fit_noise

@@ -15,15 +15,14 @@ from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.search import Model, ModelSet
 from lab.diagnose.inference.weigh import Candidate
+from lab.diagnose.outcome.detectability import detectable, told_as
 from lab.diagnose.outcome.goodness_of_fit import (
     detectability,
-    detectable,
     measurement_fits,
     places,
     residual_curves,
     set_sentences,
     side_models,
-    told_as,
 )
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import RecordingSet

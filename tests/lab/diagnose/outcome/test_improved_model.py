@@ -15,7 +15,9 @@ from evaluation.independent_simulator import laws as concealed_laws
 from lab.diagnose import Diagnosis, examine
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
 from lab.diagnose.inference.measurement_model import MeasurementModel, form_name
-from lab.diagnose.outcome.improved_model import _nearest_form, improved_model, residual_pictures
+from lab.diagnose.outcome.corrections import nearest_form
+from lab.diagnose.outcome.improved_model import improved_model
+from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile, default_camera, read_camera, write_camera
 from lab.formats.camera_model import camera_model
@@ -156,8 +158,8 @@ def test_a_correction_acts_on_the_stage_of_its_measurement(axis: str, unit: str,
 def test_the_form_that_the_recordings_show_is_saved() -> None:
     """Of a filter's forms, quartz's dispersion at 0.9 of its strength; neither at 0.3."""
     plain = OpticalLowPassFilter(displacement_x_um=2.0)
-    assert _nearest_form(plain, {form_name(plain, 0): 0.9, form_name(plain, 1): 0.2}).plate == "quartz"  # type: ignore[attr-defined]
-    assert _nearest_form(plain, {form_name(plain, 0): 0.3}) == plain
+    assert nearest_form(plain, {form_name(plain, 0): 0.9, form_name(plain, 1): 0.2}).plate == "quartz"  # type: ignore[attr-defined]
+    assert nearest_form(plain, {form_name(plain, 0): 0.3}) == plain
 
 
 # --- Residual pictures of recordings: structure without the effect in the model, noise with it ------------------------

@@ -10,10 +10,11 @@ import pytest
 from pydantic import Field
 
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.outcome.merge_sides import _choices, merged
+from lab.diagnose.outcome.merge_sides import merged
+from lab.diagnose.outcome.named_in_words import choices_of
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
-from lab.formats.results import DiagnosisLists, DiagnosisResult, NamedEffect, ParameterValue
+from lab.formats.results import Combination, DiagnosisLists, DiagnosisResult, NamedEffect, ParameterValue
 from lab.report.answers import effect_line
 from sim.camera import Side
 from sim.effects.base import Effect
@@ -32,17 +33,17 @@ class _Rows(Effect):
 
 def test_the_choices_of_a_law_are_its_alternatives_and_no_seeds() -> None:
     glow = effect("amplifier_glow")(glow_e_per_s=3.0, corner="bottom_right")
-    assert _choices(glow) == {"corner": "bottom_right"}
-    assert _choices(effect("row_noise")(noise_e=3.0, pattern_seed=4)) == {}
-    assert _choices(effect("optical_low_pass_filter")(displacement_x_um=2.0)) == {}
+    assert choices_of(glow) == {"corner": "bottom_right"}
+    assert choices_of(effect("row_noise")(noise_e=3.0, pattern_seed=4)) == {}
+    assert choices_of(effect("optical_low_pass_filter")(displacement_x_um=2.0)) == {}
 
 
 def test_integers_with_bounds_are_told_and_all_that_are_alike() -> None:
     """A period among listed numbers, and a row; what the recordings can't tell from them stands beside them."""
     found = _Rows(first_row=3, seed=5)
-    assert _choices(found) == {"period": "8", "first_row": "3"}
+    assert choices_of(found) == {"period": "8", "first_row": "3"}
     alike = (_Rows(first_row=1), _Rows(first_row=3, period=4))
-    assert _choices(found, alike) == {"period": "8 or 4", "first_row": "3 or 1"}
+    assert choices_of(found, alike) == {"period": "8 or 4", "first_row": "3 or 1"}
 
 
 def test_a_finding_says_which_alternative_it_is() -> None:
@@ -147,3 +148,28 @@ def test_what_both_sides_share_is_no_better_told_by_two() -> None:
     assert "settling_min" not in drift.parameters
     hot = _both(HotPixels(excess_e_per_s=300.0), HOT.std).effects[0]
     assert hot.parameters["excess_e_per_s"].std == pytest.approx(20.0 / np.sqrt(2.0))
+
+
+def test_sizes_that_are_not_determined_are_reported_with_the_combination_that_is() -> None:
+    axial = effect("axial_chromatic_aberration")(slope_um=15.0, curvature_um=12.0)
+    combined = Combination(
+        side="left",
+        parameters=("slope_um", "curvature_um"),
+        weights=(1.0, 0.62),
+        power=2,
+        value=314.0,
+        std=9.0,
+        unit="um^2",
+    )
+    candidate = Candidate(axial, {"slope_um": 21.0, "curvature_um": 2.0}, 0.99, (), 40.0)
+    found = SideFindings(
+        side="left",
+        lists=DiagnosisLists(),
+        is_judged=True,
+        named=(NamedCandidate(candidate, ("slanted_edge",), combinations=(combined,)),),
+    )
+    (told,) = merged("a set", [found], DecisionPolicy()).effects
+    assert told.combinations == (combined,)
+    assert not told.parameters["slope_um"].is_determined and told.parameters["curvature_um"].is_determined
+    assert "slope 15 ± 21 µm, not determined, curvature 12.0 ± 2.0 µm, " in told.statement
+    assert "slope_um^2 + 0.62 curvature_um^2 = 314.0 ± 9.0 um^2 is, of the left camera" in told.statement

@@ -14,8 +14,9 @@ from lab.capture.station import Station
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
-from lab.diagnose.outcome.next_capture import doubt_of, next_sentence
+from lab.diagnose.outcome.candidate_captures import CandidateCapture, Hypothesis, candidate_captures
+from lab.diagnose.outcome.next_capture import next_sentence
+from lab.diagnose.outcome.rivals_in_doubt import doubt_of
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.visibility import visibility
@@ -27,6 +28,7 @@ from lab.observables.observable import Label, Observable, Prediction
 from sim.effects.astigmatism import Astigmatism
 from sim.effects.base import Effect
 from sim.effects.black_level_drift import BlackLevelDrift
+from sim.effects.exposure_offset import ExposureOffset
 from sim.effects.infrared_cut_filter import InfraredCutFilter
 from sim.effects.library import effect
 from sim.effects.nonlinearity import Nonlinearity
@@ -299,3 +301,66 @@ def test_a_station_without_these_targets_lacks_them_in_one_line() -> None:
         with pytest.raises(InputError, match="add ") as refused:
             plan.steps(there)
         assert "\n" not in str(refused.value)
+
+
+LAMP = fake_bench.station(
+    light_source={
+        "driver": "fake",
+        "address": "lamp",
+        "lights": {
+            "3000 K": {"colour_temperature_k": 3000, "channels": {"460": 0.14, "635": 0.78}},
+            "6500 K": {"colour_temperature_k": 6500, "channels": {"460": 0.46, "635": 0.30}},
+        },
+    }
+)
+
+
+def _lamp_captures(station: Station | None) -> dict[str, CandidateCapture]:
+    every = candidate_captures(SET, "left", _model(), station)
+    return {one.words: one for one in every if "light source" in one.words}
+
+
+def test_a_station_with_a_light_source_is_offered_its_levels_and_colour_temperatures() -> None:
+    found = _lamp_captures(LAMP)
+    assert list(found) == [
+        "flats in the light source's light of 3000 K",
+        "flats in the light source's light of 6500 K",
+        "flats at the light source's full level and at 10 % of it, exposed 10 times as long",
+    ]
+    for one in found.values():
+        assert one.plan is not None
+        steps = one.plan.steps(LAMP)
+        assert {bool(step.setting.lamp) for step in steps if step.captures} == {True}
+        assert np.all(np.linalg.eigvalsh(one.covariance) > 0.0)
+    dimmed = found["flats at the light source's full level and at 10 % of it, exposed 10 times as long"].plan
+    assert dimmed is not None
+    assert {round(step.setting.lamp["460"], 6) for step in dimmed.steps(LAMP)} == {0.14, 0.014}
+    assert not _lamp_captures(fake_bench.station()) and not _lamp_captures(None)
+
+
+def _apart(capture: CandidateCapture, one: Effect, other: Effect) -> float:
+    difference = capture.predict(Hypothesis("", (one,), CAMERA)) - capture.predict(Hypothesis("", (other,), CAMERA))
+    return float(difference @ np.linalg.solve(capture.covariance, difference))
+
+
+def test_a_dimmed_light_tells_an_exposure_offset_from_a_brighter_lamp() -> None:
+    """A level that is off by a share is a nuisance parameter of each level: null limit. An offset of the exposure
+    isn't: at the same signal it is a tenth of the share where exposures are ten times as long."""
+    dimmed = next(one for words, one in _lamp_captures(LAMP).items() if "exposed" in words)
+    none = ExposureOffset(offset_us=0.0)
+    assert _apart(dimmed, ExposureOffset(offset_us=20.0), none) > 100.0
+    # A drift by time changes nothing: all predictions are of the same moment.
+    assert _apart(dimmed, SourceDrift(drift_percent_per_min=5.0), none) == pytest.approx(0.0, abs=1e-9)
+    # In proportion to the offset squared, as the law is linear in it: 4, to the noise of the black level's freedom.
+    ratio = _apart(dimmed, ExposureOffset(offset_us=40.0), none) / _apart(dimmed, ExposureOffset(offset_us=20.0), none)
+    assert ratio == pytest.approx(4.0, rel=1e-3)
+
+
+def test_colour_temperatures_tell_a_spectral_effect_and_no_nonlinearity_of_a_camera_without_colour() -> None:
+    warm, cold = (one for words, one in _lamp_captures(LAMP).items() if "exposed" not in words)
+    cut, wider = InfraredCutFilter(cut_wavelength_nm=650.0), InfraredCutFilter(cut_wavelength_nm=640.0)
+    assert _apart(warm, cut, wider) > _apart(cold, cut, wider) > 1.0  # more of the warm light is red
+    mono = CAMERA.model_copy(update={"cfa": "MONO", "quantum_efficiency": {"Y": CAMERA.quantum_efficiency["G"]}})
+    model = MeasurementModel(_model().blocks, mono)
+    words = [one.words for one in candidate_captures(SET, "left", model, LAMP)]
+    assert not any("light of 3000 K" in one for one in words)

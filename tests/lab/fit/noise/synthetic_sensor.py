@@ -34,6 +34,7 @@ class Sensor:
     brighter_fatter: float = 0.0  # variance e (1 - bf e / full)
     channel: tuple[tuple[str, float], ...] = (("R", 0.7), ("G1", 1.0), ("G2", 1.0), ("B", 0.5), ("Y", 1.0))
     corner: float = 0.0  # loss of light in the corner, quadratic
+    flicker: float = 0.0  # amplitude of the light's wave over 37 rows, of another phase in each frame
 
     def pattern(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         return self.prnu * rng.standard_normal(self.shape), self.dsnu * rng.standard_normal(self.shape)
@@ -47,6 +48,9 @@ class Sensor:
             np.multiply(plane, share[name], out=plane)
         row, col = (np.linspace(-1, 1, n) for n in self.shape)
         mean *= 1.0 - self.corner * 0.5 * (row[:, None] ** 2 + col**2)
+        if self.flicker:
+            wave = np.sin(2.0 * np.pi * (np.arange(self.shape[0]) / 37.0 + rng.random()))
+            mean *= 1.0 + self.flicker * wave[:, None]
         mean = mean * (1.0 + pattern[0]) + self.dark_rate * exposure_s
         variance = mean * (1.0 - self.brighter_fatter * mean / self.full)
         charge = np.minimum(mean + np.sqrt(variance) * rng.standard_normal(self.shape), self.well)

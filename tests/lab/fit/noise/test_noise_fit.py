@@ -10,8 +10,8 @@ import pytest
 
 from lab.errors import InputError
 from lab.fit.noise.dark_current import temperature_law
-from lab.fit.noise.evaluation import fit_transfer
 from lab.fit.noise.noise_fit import fit_level_table, noise_fit
+from lab.fit.noise.transfer import fit_transfer
 from lab.formats.recording_set import DataSheet
 from lab.observables.noise.levels import MeasuredLevel
 from tests.lab.fit.noise.synthetic_sensor import TRUTHS, Sensor, levels, measured, scores
@@ -55,6 +55,15 @@ def test_shading_is_no_prnu() -> None:
     fit = measured(sensor, np.random.default_rng(10))
     assert abs(fit.prnu_percent - 0.4) < 3.5 * fit.prnu_percent_std
     assert abs(fit.conversion_gain_dn_per_e - 0.5) < 3.5 * fit.conversion_gain_dn_per_e_std
+
+
+@pytest.mark.parametrize("cfa", ["MONO", "GBRG"])
+def test_bands_of_a_flickering_light_are_no_shot_noise(cfa: str) -> None:
+    """A wave of 3 % over the rows adds (0.03 x 7000 e)^2 / 2 = 22,000 e^2 to a shot noise of 7,000 e^2."""
+    found = measured(Sensor(cfa=cfa, flicker=0.03), np.random.default_rng(18))
+    assert abs(found.conversion_gain_dn_per_e - 0.5) < 3.5 * found.conversion_gain_dn_per_e_std
+    # counted as shot noise, the wave would make it four times as large
+    assert found.conversion_gain_dn_per_e == pytest.approx(0.5, rel=0.02)
 
 
 def test_drift_is_said_and_a_steady_lamp_is_not_accused() -> None:

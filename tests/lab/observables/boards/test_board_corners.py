@@ -166,7 +166,7 @@ def test_distortion_of_drawn_frames_is_predicted_through_the_fit() -> None:
 
 @pytest.mark.parametrize("cfa", ["RGGB", "GBRG", *(pytest.param(c, marks=pytest.mark.slow) for c in ("BGGR", "GRBG"))])
 def test_lateral_colour_of_drawn_frames_is_predicted(cfa: str) -> None:
-    """3 um at the corner is a pixel; a ring has the floor of 0.012 px. chi2 within 3 sigma above n."""
+    """3 um at the corner is a pixel. chi2 within 3 sigma above n."""
     law = concealed.LateralColourLaw(3.0, 0, 5)
     block = measure_board_colour(dataset_of(recorded(law, cfa=cfa)))
     effect = library_effect(law.effect)(**law.library_parameters())

@@ -34,9 +34,9 @@ from sim.effects.library import effect
 from sim.effects.row_noise import RowNoise
 from sim.frame import Exposure, sample
 from sim.scene.scenes import Darkness
-from sim.sensor.defects import defect_sizes, size_nodes
+from sim.sensor.defects import Defects, defect_sizes, node_std, size_nodes
 from sim.sensor.electrons import FixedPattern
-from sim.spectrum import Spectrum
+from sim.spectrum import FloatArray, Spectrum
 from sim.stages import signal_of
 
 ROWS, COLS = 96, 128
@@ -190,15 +190,40 @@ def test_clipped_square_is_its_integral() -> None:
 
 @pytest.mark.parametrize("spread", [0.0, 0.3, 1.0, 2.0])
 def test_nodes_have_the_distribution_that_is_drawn(spread: float) -> None:
-    """Mean 1; the standard deviation of 24 parts' means falls short by 2 %; drawn sizes agree with both at 4.5
+    """Mean 1; the standard deviation of 48 parts' means falls short by 1 %; drawn sizes agree with both at 4.5
     sigma."""
     weights, sizes = size_nodes(spread)
     assert weights.sum() == pytest.approx(1.0)
     assert weights @ sizes == pytest.approx(1.0, rel=1e-6)
     assert np.sqrt(weights @ np.square(sizes - 1.0)) == pytest.approx(spread, rel=0.05, abs=1e-9)
+    # with the scatter within the parts, the variance is the whole
+    inner = weights @ np.square(node_std(spread))
+    assert np.sqrt(weights @ np.square(sizes - 1.0) + inner) == pytest.approx(spread, rel=1e-6, abs=1e-9)
     drawn = defect_sizes((300, 300), 0.2, 3, spread)
     drawn = drawn[drawn > 0]
     assert drawn.mean() == pytest.approx(1.0, abs=4.5 * spread / np.sqrt(drawn.size) + 1e-9)
+
+
+def test_counts_of_hot_pixels_are_smooth_in_their_size() -> None:
+    """Bins narrower than the distance of the nodes, in noise narrower still: the counts of an exponential distribution
+    are its own, exp(-low / mean) - exp(-high / mean), within 3 %: a part of 1 / 24 of all at most, taken as normal in
+    the place of uniform, is wrong by 6 % of it beyond a place, at either edge of a bin. And a mean larger by 1e-4
+    changes none by more than 1e-4 times the largest slope of that, |x| exp(-x) <= 1 / e, times two."""
+    hot = Defects(0.01, 400.0, 1.0, 0)
+
+    def counts(factor: float) -> FloatArray:
+        classes = [
+            defective_pixels._DefectClass(float(s), factor * float(x), 0.0, spread_dn=factor * float(w))
+            for s, x, w in zip(*hot.nodes(), hot.node_std(), strict=True)
+        ]
+        return defective_pixels._tail_shares(classes, 1.0, 0.0, 1, 10.0, 0.0, 0.0)[: len(TAIL_EDGES)]
+
+    edges = np.array([*TAIL_EDGES, np.inf]) * 10.0
+    found, wanted = counts(1.0), 0.01 * -np.diff(np.exp(-edges / 400.0))
+    use = np.flatnonzero((edges[:-1] >= 60.0) & (wanted > 1e-4))
+    assert use.size > 3
+    np.testing.assert_allclose(found[use], wanted[use], rtol=0.03)
+    assert np.abs(counts(1.0001) - found).max() < 2.0 * 1e-4 * 0.01 / np.e
 
 
 def test_correlated_rows_have_their_spectrum() -> None:

@@ -190,3 +190,21 @@ def test_an_edge_is_summarised_once_for_all_statements() -> None:
     assert measure_edge(recordings.without({"none"}), [capture], "Y") is summary
     other = {capture.frame: np.array(recordings.frame(capture))}
     assert measure_edge(recordings.with_frames(other), [capture], "Y") is not summary
+
+
+@pytest.mark.parametrize("cfa", ["MONO", "GRBG"])
+def test_edges_of_unstated_angles_are_told_apart_by_the_frames(cfa: str) -> None:
+    """Four edges of two repeats each in one region: without `angle_deg` they are the same eight captures in pairs,
+    and the numbers are equal bit for bit."""
+    stated = recordings_of(ConcealedCamera(5, cfa=cfa, rows=120, cols=160), Plan(("dark", "slanted_edge")))
+    document = stated.manifest.model_dump(mode="json", exclude_none=True)
+    for capture in document["captures"]:
+        capture.pop("angle_deg", None)
+    bare = stated.under(Manifest.model_validate(document))
+    of_stated, of_bare = (
+        measure_slanted_edge(Dataset(one, "left", camera_model(one, "left", None, maker_curves=True)))
+        for one in (stated, bare)
+    )
+    assert len({label.captures for label in of_bare.labels}) == 8  # one of two repeats is held out
+    assert [label.captures for label in of_bare.labels] == [label.captures for label in of_stated.labels]
+    np.testing.assert_array_equal(of_bare.value, of_stated.value)

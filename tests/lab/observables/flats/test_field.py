@@ -26,6 +26,8 @@ from lab.observables.flats.field import (
     _adjacent,
     _cell_means,
     _cell_points,
+    _cells,
+    _channel_points,
     _pattern_variance,
     measure_flat_field,
 )
@@ -33,6 +35,8 @@ from lab.observables.flats.green_balance import measure_green_balance
 from lab.observables.flats.linearity import measure_photon_transfer
 from lab.observables.flats.rows import measure_flat_rows
 from lab.observables.observable import Observable
+from sim.camera import Cfa
+from sim.sensor import mosaic
 from tests.lab.diagnose.on_blocks import dataset, former, measured_model, names, rendered, sigmas, verdict
 from tests.sim.local_effects import ReadOutRamp
 
@@ -108,6 +112,25 @@ def test_a_pattern_that_neighbours_share_counts_more() -> None:
     alike = 0.8 * (white - 1.0) + 0.02 * np.kron(rng.standard_normal((48, 64)), np.ones((4, 4)))
     single = _pattern_variance(1.0 + 0.8 * (white - 1.0), 0.0)
     assert single < _pattern_variance(1.0 + alike, 0.0) <= ALIKE * _adjacent(1.0 + alike, 1)
+
+
+@pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG", "MONO"])
+@pytest.mark.parametrize("shape", [(24, 32), (50, 70)])
+def test_cells_are_predicted_where_the_pixels_of_their_channel_stand(cfa: Cfa, shape: tuple[int, int]) -> None:
+    """A bowl about the axis, x^2 + y^2 of the pixels' middles: means over pixels `step` apart are less than those over
+    the cells' area by step^2 / 12 along each axis, which is the same in all cells."""
+    camera = dataset(former(1, kinds=("dark", "flat"))).camera.model_copy(
+        update={"rows": shape[0], "cols": shape[1], "cfa": cfa}
+    )
+    step = mosaic.step(cfa)
+    row, col = (np.arange(n) - 0.5 * (n - 1) for n in shape)
+    bowl = np.square(row[:, None]) + np.square(col)
+    for channel, points in _channel_points(camera, 0.0, 0.0).items():
+        plane = np.mean([bowl[r::step, c::step] for r, c in mosaic.phases(cfa)[channel]], axis=0)
+        predicted = _cell_means((points.x_um**2 + points.y_um**2) / camera.pixel_pitch_um**2)
+        # greens of two phases: their mean place stands for the mean of their squares, 0.25 px^2 too little an axis
+        two = 0.5 * (len(mosaic.phases(cfa)[channel]) - 1)
+        np.testing.assert_allclose(_cells(plane).ravel(), predicted - step**2 / 6.0 + two, atol=1e-9)
 
 
 def test_means_over_cells_are_exact_for_the_fourth_power() -> None:

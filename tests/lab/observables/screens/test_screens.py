@@ -41,6 +41,7 @@ from sim.effects.defocus import Defocus
 from sim.effects.ghost import Ghost
 from sim.effects.moffat_blur import MoffatBlur
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
+from sim.effects.pixel_aperture import PixelAperture
 from sim.effects.screen_gamma import ScreenGamma
 from sim.point import halos
 from tests.lab.diagnose.on_blocks import former, names, verdict
@@ -212,6 +213,20 @@ def test_a_filter_is_predicted_on_a_screen_of_any_geometry(cell_px: float, turn_
     for name, std in found.std[0].items():
         assert std is not None
         assert abs(getattr(found.effects[0], name) - 1.9) < 3.0 * std
+
+
+def test_a_narrow_aperture_is_predicted_beyond_the_null_of_the_stated_one() -> None:
+    """An aperture 0.9 um narrower than stated: where the stated one's OTF is 0, a ratio to it has no bound. With the
+    effect chi2 of n numbers is at most n + 3 sqrt(2 n), without it far above."""
+    law = concealed.PixelApertureLaw(0.9, 0, 1)
+    plan = Plan(kinds=("dark", "flat", "screen"), screen_cell_px=4.0, screen_turn_deg=0.5)
+    camera = ConcealedCamera(62, (law,), rows=288, cols=384)
+    dataset = dataset_of(recordings_of(camera, plan))
+    model = measured_model(dataset, measure_bernoulli)
+    n = int(model.seen.sum())
+    effect = PixelAperture(side_change_um=law.signed_strength)
+    assert model.seen_gaussian((effect,)).chi2(model.seen_value) < n + 3.0 * np.sqrt(2.0 * n)
+    assert model.seen_gaussian(()).chi2(model.seen_value) > 3.0 * n
 
 
 def test_pattern_fits_are_freed_with_their_study() -> None:

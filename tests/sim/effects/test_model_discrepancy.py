@@ -1,12 +1,11 @@
-"""Departures of the transfer function by direction and by wavelength."""
+"""Model discrepancies of the transfer function by direction and by wavelength."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
-from sim.effects.transfer_discrepancy import TransferDiscrepancy
+from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.stages import image_of
 from tests.sim.effects.test_sensor_effects import CAMERA
 
@@ -14,7 +13,8 @@ FX, FY = np.array([0.05, 0.0, 0.05]), np.array([0.0, 0.05, 0.05])
 
 
 def _transfer(shape: str, wavelength_nm: float) -> np.ndarray:
-    effect = TransferDiscrepancy(shape=shape, at=(0.0, 0.1), change=(0.0, 0.2), strength=1.0)
+    along = f"{shape}_frequency_cy_per_um"
+    effect = ModelDiscrepancy.model_validate({"along": along, "at": (0.0, 0.1), "factor": (1.0, 1.2), "strength": 1.0})
     (law,) = image_of(CAMERA, (effect,)).transfer
     return np.asarray(law(FX, FY, wavelength_nm))
 
@@ -28,8 +28,12 @@ def test_its_shapes_are_those_of_two_phi_and_of_the_wavelength() -> None:
     np.testing.assert_allclose(_transfer("chromatic", 700.0), 1.0 + 0.1 * np.array([1, 1, np.sqrt(2.0)]), atol=1e-12)
 
 
-def test_it_keeps_the_light_and_is_nothing_by_default() -> None:
-    """At frequency 0 nothing changes; without strength nothing does."""
-    assert image_of(CAMERA, (TransferDiscrepancy(),)).transfer == ()
-    with pytest.raises(ValidationError, match="frequency 0"):
-        TransferDiscrepancy(at=(0.01, 0.1))
+@pytest.mark.parametrize("shape", ["astigmatic", "diagonal", "chromatic"])
+def test_it_keeps_the_light_and_is_nothing_by_default(shape: str) -> None:
+    """At frequency 0 nothing changes, whatever the factor there; without strength nothing does."""
+    effect = ModelDiscrepancy.model_validate(
+        {"along": f"{shape}_frequency_cy_per_um", "at": (0.0, 0.1), "factor": (0.8, 1.2), "strength": 1.0}
+    )
+    (law,) = image_of(CAMERA, (effect,)).transfer
+    assert float(law(np.zeros(1), np.zeros(1), 700.0)[0]) == pytest.approx(1.0, abs=1e-15)
+    assert image_of(CAMERA, (effect.replace_fields(strength=0.0),)).transfer == ()
