@@ -57,7 +57,7 @@ def test_two_weak_columns_are_integrated_as_by_quadrature() -> None:
     coordinate = Coordinate("a", 1.0, lower=0.0)
     one = Signature("pair", 0, np.zeros((1, 2)), (coordinate,) * 2, (0, 1), ())
     c = (np.arange(600) + 0.5) * 0.02
-    prior = coordinate.log_prior(c) + np.log(0.02)
+    prior = coordinate.log_prior(np.asarray(c, float)) + np.log(0.02)
     quadratic = -2.0 * np.square(c[:, None]) - 2.0 * np.square(c) - 2.0 * np.outer(c, c) + prior[:, None] + prior
     away = []
     for z in np.random.default_rng(1).multivariate_normal(np.zeros(2), gram, 20):
