@@ -22,7 +22,6 @@ from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 from sim.uniform import STRAYS, FieldPoints, Uniform
 
-GREEN_FLOOR = 1e-4  # standard deviation of the ratio of equal greens beside noise
 GREEN_NOISE = 0.02  # ratios of a larger standard deviation aren't used
 CELLS = (3, 4)  # of the frame: rows, columns
 TILE_ROWS, TILE_COLS = mosaic.PERIOD_PX, 4  # size of the uniform frame by which effects are predicted
@@ -66,7 +65,7 @@ def measure_green_balance(dataset: Dataset) -> Observable:
         raise NotDetermined("green_balance", "no unclipped flat or narrowband captures")
     common = dataset.noise.prnu**2 * _share(*_green_shape(dataset))
     value = np.array([r.value for r in ratios])
-    covariance = np.diag([r.std**2 + GREEN_FLOOR**2 for r in ratios]) + common
+    covariance = np.diag([r.std**2 for r in ratios]) + common
     labels = [Label(r.x, "G", r.condition, r.captures, r.held_out) for r in ratios]
     number = CELLS[0] * CELLS[1]
     for held_out, (image, noise) in sorted(images.items()):  # seen frames first
@@ -77,10 +76,12 @@ def measure_green_balance(dataset: Dataset) -> Observable:
         labels += [Label(0.0, "G", f"cell {k // CELLS[1]},{k % CELLS[1]}", members, held_out) for k in range(number)]
         size = len(covariance)
         centring = np.eye(number) - 1.0 / number
-        one = centring @ np.diag(_cell_shares(red_rows.shape)) @ centring
+        shares = _cell_shares(red_rows.shape)
+        # the cells are less their mean, which doesn't vary: it is given a cell's variance, for a matrix of full rank
+        one = centring @ np.diag(shares) @ centring + np.mean(shares) / number
         bigger = np.zeros((size + number, size + number))
         bigger[:size, :size] = covariance
-        bigger[size:, size:] = (dataset.noise.prnu**2 + noise) * one + GREEN_FLOOR**2 * np.eye(number)
+        bigger[size:, size:] = (dataset.noise.prnu**2 + noise) * one
         if held_out and False in images:
             # PRNU is the same in seen and held-out frames
             bigger[size:, size - number : size] = dataset.noise.prnu**2 * one
