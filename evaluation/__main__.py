@@ -235,7 +235,9 @@ def third_party_command(
     out: Annotated[
         Path, typer.Option("--out", metavar="FILE", help="file of the results, one line a set; it is continued there")
     ],
-    sets: Annotated[int, typer.Option("--sets", min=1, metavar="N", help="sets of each model")] = 20,
+    sets: Annotated[
+        int, typer.Option("--sets", min=0, metavar="N", help="sets of each model; 0: the table of what FILE holds")
+    ] = 20,
     effect: Annotated[
         list[str] | None,
         typer.Option("--effect", metavar="NAME", help="this model, by its effect's name (without: every one)"),

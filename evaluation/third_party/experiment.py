@@ -87,7 +87,8 @@ def draw_set(source: str, number: int) -> tuple[RecordingSet, dict[str, float], 
 
 
 def diagnose_sets(file: Path, sets: int, sources: Sequence[str]) -> list[Diagnosed]:
-    """Return the results of `sets` sets of each source. Those in `file` aren't diagnosed again."""
+    """Return the results of `sets` sets of each source. Those in `file` aren't diagnosed again; 0: all of those, and no
+    more."""
     results = list(_kept(file))
     done = {(one.source, one.set) for one in results}
     for number in range(1, sets + 1):
@@ -98,7 +99,7 @@ def diagnose_sets(file: Path, sets: int, sources: Sequence[str]) -> list[Diagnos
             with file.open("a", encoding="utf-8") as lines:
                 lines.write(json.dumps(asdict(result)) + "\n")
             results.append(result)
-    return [one for one in results if one.set <= sets and one.source in sources]
+    return [one for one in results if one.source in sources and (sets == 0 or one.set <= sets)]
 
 
 def diagnose_set(source: str, number: int) -> Diagnosed:
