@@ -33,6 +33,7 @@ from lab.capture.records import RunRecord
 from lab.capture.session import Progress
 from lab.capture.station import Station
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
+from lab.capture_kinds.lamp import LampLight
 from lab.engine import DEFAULT_ENGINE, Engine
 from lab.formats.importers import KINDS
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
@@ -142,6 +143,9 @@ class StationState(Schema):
     cameras: tuple[Side, ...] = ()
     instruments: dict[str, str] = Field(default={}, description="family of the instrument -> its driver")
     targets: tuple[str, ...] = ()
+    lights: dict[str, LampLight] = Field(
+        default={}, description="of its light source, by name: what `lamp_level` and `colour_temperature_k` ask for"
+    )
     sequences: tuple[SequenceName, ...] = Field(default=(), description="what it has the instruments and targets for")
     busy_with: str | None = Field(default=None, description="id of a session that uses its instruments now")
     safety: StationSafety | None = Field(

@@ -111,6 +111,16 @@ export async function showEstimate(station, quick) {
   }
 }
 
+/** The lights that a station's sequences may ask for, in a line; empty where it has no light source.
+ * @param {Model<"StationState">} station */
+function lightsText({ lights }) {
+  const every = Object.entries(lights ?? {}).map(([name, light]) => {
+    const channels = Object.entries(light.channels).map(([channel, share]) => `${channel} at ${Number((100 * share).toFixed(1))} %`);
+    return `${name} (${channels.join(", ")})`;
+  });
+  return every.length ? `Light source, for a level above 0: ${every.join("; ")}.` : "";
+}
+
 /** The plan of a station, as `quick` or not; drawn anew only where one of them changed.
  * @param {Model<"StationState"> | undefined} station @param {boolean} quick */
 export async function showPlan(station, quick) {
@@ -118,6 +128,7 @@ export async function showPlan(station, quick) {
   const wanted = station ? JSON.stringify([station.name, station.sequences]) : "";
   const of = `${wanted} ${quick}`;
   if (of === shown || !station) return;
+  $("plan-lights").textContent = lightsText(station);
   const same = shown.startsWith(`${wanted} `);
   shown = of;
   catalogue ??= await ask("/sequences");

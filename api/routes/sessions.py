@@ -68,6 +68,7 @@ def station_state(service: Service, name: str) -> StationState:
         cameras=station.sides,
         instruments={name: entry.driver for name, entry in station.devices.items() if not name.startswith("cameras.")},
         targets=tuple(station.targets),
+        lights=dict(station.lights),
         sequences=full_plan(station).names,
         busy_with=(busy := service.live.busy(station)),
         asks=service.asks(busy),

@@ -59,9 +59,8 @@ class FlatSequence(Sequence):
     again, with exposures found anew: with the gain of a multiplying register its excess noise changes, while that of
     an amplifier keeps the shot noise of electrons. `darks_after`: dark frames of `dark_after_s` that follow bright
     flats at the end, the light closed: they show charge that stays behind (image lag, persistence), which dark frames
-    before any light don't. With a `lamp_level` above 0 the light source lights the sphere in
-    place of the monochromator: its light of `colour_temperature_k`, or of `wavelength_nm`, else the first of the
-    station file."""
+    before any light don't. With a `lamp_level` above 0 the light source lights the sphere in place of the
+    monochromator: its light of `colour_temperature_k`, or of `wavelength_nm`, else the first of the station file."""
 
     name: ClassVar[str] = "flat"
     purpose: ClassVar[str] = "conversion gain, PRNU, full well, linearity (photon transfer)"
@@ -117,7 +116,7 @@ class FlatSequence(Sequence):
             id = f"{stem}/before-dark/{frame}"
             captures = tuple(
                 FlatCapture(kind="flat", radiance=light.radiance, wavelength_nm=self.wavelength_nm or None,
-                            **planned_keys(id, side))
+                            colour_temperature_k=self.colour_temperature_k, **planned_keys(id, side))
                 for side in station.sides
             )  # fmt: skip
             exposure = RelativeExposure(of=found.id, factor=BRIGHT / self.level_found)

@@ -62,6 +62,18 @@ REFRESH = """async () => (await import("/static/page.js")).tellHalts(await (awai
 #: Has nothing follow the sessions that are started: a pipeline by default.
 NOTHING_FOLLOWS = """() => { const then = document.querySelector("#start-form select[name=then]");
     window.followed = then.value; then.value = ""; then.dispatchEvent(new Event("change", {bubbles: true})) }"""
+#: A station's light source.
+LAMP = """
+[light_source]
+driver = "fake"
+address = "lamp"
+[light_source.lights."3000 K"]
+colour_temperature_k = 3000
+channels = {460 = 0.14, 635 = 0.78}
+[light_source.lights."460 nm"]
+wavelength_nm = 460
+channels = {460 = 1.0}
+"""
 #: Where the planes of the fakes' frames begin, by channel.
 FIRSTS = first_pixels("RGGB")
 #: The views by their addresses, and what stands in each when it is complete. Words in capitals: ids.
@@ -708,6 +720,34 @@ def test_a_session_is_planned_on_the_page(browser: Any, lab: Running) -> None:
     page.fill("#start-form input[name=name]", "as planned")
     page.click("#start")
     watched.go("/sessions", "#sessions tr:has-text('as planned') td:has-text('/10')")
+    watched.close()
+
+
+def test_a_light_source_is_shown_and_set_in_the_plan(browser: Any, lab: Running) -> None:
+    with_lamp = STATION.replace('address = "', 'address = "other ').replace("a bench of fakes", "lamp bench") + LAMP
+    (lab.store.root / "stations" / "lamp.toml").write_text(with_lamp)
+    watched = Watched(browser, lab)
+    watched.log_in(lab)
+    page = watched.page
+    page.reload()
+    page.wait_for_selector("#start-station option[value=lamp]", state="attached")
+    page.select_option("#start-station", "lamp")
+    page.wait_for_selector(
+        "#plan-lights:has-text('3000 K (460 at 14 %, 635 at 78 %); 460 nm (460 at 100 %)')", state="attached"
+    )
+    page.click("#plan > summary")
+    flat = page.locator("#plan-rows li", has=page.locator("strong:text-is('flat')"))
+    flat.locator("summary").click()
+    flat.locator("label:has(span[title=lamp_level]) input").fill("0.5")
+    flat.locator("label:has(span[title=colour_temperature_k]) input").fill("5000")
+    page.keyboard.press("Tab")
+    page.wait_for_selector("#plan-problem:has-text('no light of colour_temperature_k = 5000; it has 3000 K')")
+    flat.locator("label:has(span[title=colour_temperature_k]) input").fill("3000")
+    page.keyboard.press("Tab")
+    page.wait_for_selector("#plan-words:has-text('captures')")
+    assert page.inner_text("#plan-problem") == ""
+    assert watched.faults() == [] and watched.sideways_px() == 0
+    watched.complaints = [line for line in watched.complaints if "422" not in line]  # the refused colour temperature
     watched.close()
 
 

@@ -20,7 +20,7 @@ from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
 from lab.capture_kinds.chart import ChartSequence
 from lab.capture_kinds.dark import DarkSequence
-from lab.capture_kinds.flat import FlatSequence
+from lab.capture_kinds.flat import FlatCapture, FlatSequence
 from lab.capture_kinds.slanted_edge import EdgeSequence
 from lab.errors import DeviceError, InputError
 from lab.formats.recording_set import inspect
@@ -107,6 +107,15 @@ def test_the_shutter_stays_closed_in_the_lamps_light() -> None:
     assert {tuple(step.setting.lamp.items()) for step in flats} == {(("blue", 0.1), ("red", 0.4))}
     edges = EdgeSequence(frames=1, lamp_level=1.0, wavelength_nm=460.0).steps(station(**WITH_LAMP))
     assert {tuple(step.setting.lamp.items()) for step in edges} == {(("blue", 1.0),)}
+
+
+def test_dark_frames_after_flats_in_the_lamps_light_are_dark() -> None:
+    steps = FLAT.model_copy(update={"darks_after": 3}).steps(station(**WITH_LAMP))
+    after = [step for step in steps if any(one.kind == "dark" for one in step.captures)]
+    assert len(after) == 3
+    assert {(step.setting.wavelength_nm, *step.setting.lamp) for step in after} == {(None,)}
+    flats = [one for step in steps for one in step.captures if isinstance(one, FlatCapture)]
+    assert {one.colour_temperature_k for one in flats} == {3000.0}
 
 
 def test_every_step_has_an_id_of_its_own_in_several_lights() -> None:
