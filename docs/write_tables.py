@@ -235,9 +235,11 @@ pictures. The PDF needs the extra `pdf` (matplotlib).
   falls off by more than 3 % over the sensor is such a line of EMVA 1288, and bears on all of its figures.
 - **Raw data.** Standards of photography (ISO 12233, 14524, 15739, 17957, IEEE 1858) specify the finished image.
   calibench reads planes of the raw mosaic; where that makes a difference, a line says so.
-- **Clauses** are those of the published tables of contents, of EMVA 1288 those of release 3.1, which release 4.0 Linear
-  follows. The text of the priced standards isn't quoted. Where no public text gives a formula, the one that is used is
-  stated beside the figure, and it is to be compared with the standard before a figure is certified.
+- **Clauses** of ISO 15739, 17850 and 19084 are those of the published tables of contents, of ISO 12233 those of a
+  published excerpt of the edition of 2014, of EMVA 1288 those of release 3.1, which release 4.0 Linear follows. Those
+  of the other standards, whose texts were not at hand, name the place by the standards' usual order: check them
+  against the text. It isn't quoted. Where no public text gives a formula, the one that is used is stated beside the
+  figure, and it is to be compared with the standard before a figure is certified.
 - **Uncertainty** is that of the recordings' noise, and of what is stated below. Calibrations of instruments are apart
   (`photons_systematic_std_percent` of the fit). Sensitivities enter ISO 17321-1 with the standard deviation of each
   wavelength as if these were independent, as results keep no covariance of the curves.
