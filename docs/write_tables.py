@@ -277,8 +277,11 @@ BIASES = (
     ),
     (
         "K of EMVA 1288, straight line to 70 %",
-        "−1.6 % under 1 % nonlinearity, −2.1 % under a 2 % brighter-fatter effect (the reference implementation)",
-        "[accuracy](../explanation/accuracy.md)",
+        (
+            "−1.6 % under 1 % nonlinearity, −2.1 % under a 2 % brighter-fatter effect; of a variance K x (1 − a x) the "
+            "factor 1 − a Σx³ / Σx² over the levels"
+        ),
+        "[accuracy](../explanation/accuracy.md), `tests/lab/standards/test_reading.py`",
     ),
     (
         "SMI of noisy sensitivities",

@@ -22,13 +22,14 @@ from lab.capture.catalogue import StepTimes, estimate, step_times
 from lab.capture.durable_files import write_durably
 from lab.capture.session import CaptureSession
 from lab.capture.station import drivers_of
-from lab.diagnose.outcome.expected_information import entropy, expected_information
+from lab.diagnose.outcome.expected_information import Forecast, entropy, expected_information, settling_probability
 from lab.diagnose.outcome.next_capture import Doubt, OpenCapture
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import DeviceError, InputError
 from lab.formats.recording_set import RecordingSet, Snapshots, manifest_json
 from lab.formats.result_file import read_result, result_json
 from lab.formats.results import DiagnosisResult, Resolution, ResolveEnd, ResolveJournal, RivalOdds
+from lab.inference.posterior import NAMED
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -100,6 +101,11 @@ class Choice:
     first: Option
     then: Option | None
     information_nat: float
+
+    @property
+    def forecasts(self) -> list[Forecast]:
+        """What the rivals predict of the captures."""
+        return [one.capture.forecast for one in (self.first, self.then) if one is not None]
 
     @property
     def rate(self) -> float:
@@ -216,6 +222,7 @@ class Resolver:
             capture=choice.first.capture.words,
             then="" if choice.then is None else choice.then.capture.words,
             information_nat=round(choice.information_nat, 4),
+            settles=round(settling_probability(choice.forecasts, choice.doubt.odds, NAMED), 3),
             expected_s=round(choice.first.expected_s, 1),
             session=session,
             verdict_before=result.verdict,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import shlex
 from collections.abc import Callable
 from dataclasses import replace
@@ -206,6 +205,7 @@ def _report_session(store: Store, station: Path | None, conceal: list[str] | Non
     """Capture a session for the standards, and write their pages, their PDF where matplotlib is installed, and their
     JSON into its folder."""
     from lab.cli.standards import report_standards
+    from lab.report.standards_pdf import has_matplotlib
 
     session = _carried_out(request, store, station, conceal, ["run", "--standards"]).session
     assert session is not None
@@ -214,7 +214,7 @@ def _report_session(store: Store, station: Path | None, conceal: list[str] | Non
     assert fitted is not None
     folder = store.folder(session) / "standards"
     make_folder(folder)
-    with_pdf = importlib.util.find_spec("matplotlib") is not None
+    with_pdf = has_matplotlib()
     report_standards(
         recordings, fitted, folder / "standards.json", folder, folder / "standards.pdf" if with_pdf else None
     )

@@ -43,10 +43,13 @@ def standards(
     Example: calibench standards my-camera --report pages --pdf standards.pdf
     """
     from lab.formats.results import FitResult
+    from lab.report.standards_pdf import check_pdf
 
     check_writable(json)
     check_writable(pdf)
     check_folder(report_folder)
+    if pdf is not None:
+        check_pdf()
     recordings = recordings_of(source, data)
     fitted = read_given(FitResult, fit_file) or run_here(PipelineRequest("fit", recordings=recordings)).fit
     assert fitted is not None

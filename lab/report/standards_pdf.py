@@ -31,7 +31,8 @@ PAGE_IN = (8.27, 11.69)  # A4
 LEFT, RIGHT, TOP, BOTTOM = 0.08, 0.95, 0.94, 0.06
 LINE = 0.0135  # of the page's height
 BODY_PT, SMALL_PT, HEAD_PT, TITLE_PT = 8.0, 6.8, 10.0, 15.0
-PICTURES_A_PAGE = 6
+ROW_HEIGHT = 0.285  # of a row of pictures, of the page's height
+LONGEST_LABEL = 34  # characters of a legend's entry
 NAMED = {"@fg": "#1b1b1b", "@muted": "#777777", "@grid": "#dddddd"}
 DASHES = {"solid": "-", "dash": "--", "dot": ":"}
 WRAPPED = 118  # characters of a line of body text
@@ -79,7 +80,8 @@ def draw_figure(axes: Sequence[Axes], figure: Figure) -> None:
 
 
 def _draw_trace(ax: Axes, trace: Trace) -> None:
-    name = _plain(trace.get("name", "")) if trace.get("showlegend", True) else "_"
+    full = _plain(trace.get("name", "")) if trace.get("showlegend", True) else "_"
+    name = full if "$" in full else textwrap.shorten(full, LONGEST_LABEL, placeholder="…")
     if trace["type"] == "heatmap":
         values = np.array([[np.nan if v is None else v for v in row] for row in trace["z"]], float)
         drawn = ax.imshow(values, aspect="auto", cmap="viridis", interpolation="nearest")
@@ -170,14 +172,29 @@ class _Sheet:
             )
 
 
+def has_matplotlib() -> bool:
+    """Return whether matplotlib is installed. Its distribution is asked for: where it isn't, colour-science puts
+    modules of that name in its place, which can be imported and draw nothing."""
+    try:
+        metadata.version("matplotlib")
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def check_pdf() -> None:
+    """Raise InputError where matplotlib isn't installed, before anything is computed for a PDF."""
+    if not has_matplotlib():
+        raise InputError("--pdf: matplotlib isn't installed; pip install 'calibench[pdf]'")
+
+
 def write_standards_pdf(file: Path, result: StandardsResult, found: Sequence[StandardSection], name: str) -> Path:
     """Write all standards as the PDF `file`: completely, or not at all. `found`: what the pages hold; `name`: of the
     recordings. Raises InputError where matplotlib isn't installed or the file can't be written."""
-    try:
-        import matplotlib as mpl
-        from matplotlib.backends.backend_pdf import PdfPages
-    except ImportError as error:
-        raise InputError("--pdf: matplotlib isn't installed; pip install 'calibench[pdf]'") from error
+    check_pdf()
+    import matplotlib as mpl
+    from matplotlib.backends.backend_pdf import PdfPages
+
     made = datetime.now(UTC)
     running = f"{name}; calibench {metadata.version('calibench')}, {made:%Y-%m-%d %H:%M} UTC"
     try:
@@ -267,23 +284,23 @@ def _section(sheet: _Sheet, section: StandardSection) -> None:
 
 
 def _draw_pictures(sheet: _Sheet, pictures: Sequence[StandardsPicture]) -> None:
-    for begin in range(0, len(pictures), PICTURES_A_PAGE):
-        page = sheet.begin()
-        for number, picture in enumerate(pictures[begin : begin + PICTURES_A_PAGE]):
-            row, column = divmod(number, 2)
-            left, bottom = LEFT + 0.02 + 0.46 * column, 0.70 - 0.30 * row
+    """Draw pictures, two in a row, below the text where there is room."""
+    for begin in range(0, len(pictures), 2):
+        page = sheet.room(ROW_HEIGHT / LINE)
+        bottom = sheet.y - ROW_HEIGHT + 0.045
+        sheet.y -= ROW_HEIGHT
+        for column, picture in enumerate(pictures[begin : begin + 2]):
+            left = LEFT + 0.02 + 0.46 * column
             made = picture.figure["layout"]
             if "xaxis2" in made:
-                axes = [page.add_axes((left, bottom, 0.165, 0.2)), page.add_axes((left + 0.22, bottom, 0.165, 0.2))]
+                axes = [page.add_axes((left, bottom, 0.165, 0.19)), page.add_axes((left + 0.22, bottom, 0.165, 0.19))]
             elif "yaxis2" in made:
-                axes = [page.add_axes((left, bottom + 0.11, 0.37, 0.09)), page.add_axes((left, bottom, 0.37, 0.085))]
+                axes = [page.add_axes((left, bottom + 0.1, 0.37, 0.09)), page.add_axes((left, bottom, 0.37, 0.085))]
             else:
-                axes = [page.add_axes((left, bottom, 0.37, 0.2))]
+                axes = [page.add_axes((left, bottom, 0.37, 0.19))]
             draw_figure(axes, picture.figure)
             if "yaxis2" in made and "xaxis2" not in made:
                 axes[0].set_xlabel("")
                 axes[0].tick_params(labelbottom=False)
             title = textwrap.shorten(picture.title, 52, placeholder="…")
-            page.text(left - 0.03, bottom + 0.215, _plain(title), fontsize=BODY_PT, weight="bold")
-    if pictures:
-        sheet.y = BOTTOM  # the next text begins a page
+            page.text(left - 0.03, bottom + 0.203, _plain(title), fontsize=BODY_PT, weight="bold")

@@ -146,6 +146,8 @@ class CharacteristicCurve:
         Raises NotDetermined where it stays above 1 to the brightest level.
         """
         top = int(np.argmax(self.snr))
+        if not self.snr[top] > 1.0:
+            raise NotDetermined("saturation", "no level has an input signal-to-noise ratio above 1; expose longer")
         below = np.flatnonzero(self.snr[top:] < 1.0)
         if not below.size:
             raise NotDetermined(

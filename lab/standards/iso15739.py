@@ -64,6 +64,8 @@ class Iso15739(Standard):
         gain, gain_std = steps.gain
         # L g of the reference: the signal of a linear camera
         signal, signal_std = self._at_reference(steps.exposure * gain, steps.exposure * gain_std)
+        if not signal > 2.0 * signal_std:
+            raise NotDetermined(self.name, "the OECF doesn't rise at the reference level; capture more levels about it")
         if not square > 2.0 * square_std:
             raise NotDetermined(self.name, "the noise isn't significant at the reference level; capture more repeats")
         value = signal / float(np.sqrt(square))
@@ -123,6 +125,8 @@ class Iso15739(Standard):
         steps = self.steps
         gain, gain_std = steps.gain
         noise = self.black_temporal_noise
+        if not gain[0] > 2.0 * gain_std[0]:
+            raise NotDetermined(self.name, "the OECF doesn't rise at its darkest levels; capture more of them")
         top = steps.signal.max()
         reached = np.flatnonzero(steps.signal >= 0.99 * top)
         if reached.size < 2:

@@ -80,10 +80,15 @@ class LevelSeries:
 
 
 def level_series(side: MeasuredSide, step: str) -> LevelSeries:
-    """Return the longest series of flats. Raises NotDetermined of `step` with fewer than four levels or without darks,
-    in repeats each."""
+    """Return the longest series of flats, without levels whose stated light contradicts the others (`NoiseFit`).
+
+    Raises NotDetermined of `step` with fewer than four levels or without darks, in repeats each."""
     data = side.dataset
-    groups = [group for group in data.flat_levels() if len(group) > 1]
+    noise = side.fit.noise
+    contradicting = {name for one in (noise.inconsistent_levels if noise else ()) for name in one.captures}
+    groups = [
+        group for group in data.flat_levels() if len(group) > 1 and not contradicting & {flat.id for flat in group}
+    ]
     light = light_of([c for group in groups for c in group], side.camera)
     series: dict[object, dict[float, list[FlatCapture]]] = {}
     for group in groups:

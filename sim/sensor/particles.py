@@ -67,9 +67,10 @@ class Particles:
         electrons = TRACK_E_PER_UM * self.depth_um / cosine * max(loss, 0.2)
         rows = np.floor(enters[0] + along * np.sin(turn)).astype(np.intp)
         cols = np.floor(enters[1] + along * np.cos(turn)).astype(np.intp)
-        places, which = np.unique(np.stack([rows, cols]), axis=1, return_inverse=True)
+        first, wide = cols.min(), int(np.ptp(cols)) + 1
+        places, which = np.unique(rows * wide + (cols - first), return_inverse=True)
         share = np.bincount(which.ravel()) / along.size
-        return places[0], places[1], electrons * share
+        return places // wide, places % wide + first, electrons * share
 
     def brightest_e(self, pitch_um: float) -> FloatArray:
         """Electrons of the brightest pixel of each event of a fixed sample, ascending, (`SAMPLE`,)."""

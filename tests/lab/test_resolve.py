@@ -10,7 +10,12 @@ import pytest
 
 from lab.capture.plan import CapturePlan
 from lab.capture_kinds.dark import DarkSequence
-from lab.diagnose.outcome.expected_information import Forecast, entropy, expected_information
+from lab.diagnose.outcome.expected_information import (
+    Forecast,
+    entropy,
+    expected_information,
+    settling_probability,
+)
 from lab.diagnose.outcome.next_capture import Doubt, OpenCapture
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import InputError
@@ -136,3 +141,19 @@ def test_limits_that_cannot_be_kept_are_refused(minutes: float, rounds: int, sai
     with pytest.raises(InputError, match=said) as refused:
         ResolveLimits(minutes, rounds)
     assert "\n" not in str(refused.value)
+
+
+def test_a_choice_has_the_forecasts_of_its_captures() -> None:
+    """Of one capture one, of a pair two; rivals `FAR` apart are settled for certain."""
+    found = choose(doubt(0.6, 0.4), [option("sharp", forecast(0.0, FAR))], POLICY)
+    assert found is not None
+    assert len(found.forecasts) == 1
+    assert settling_probability(found.forecasts, found.doubt.odds, 0.95) == pytest.approx(1.0)
+    pins = option("pins the size", forecast(0.0, 0.0, parameter=(50.0, 50.0)))
+    needs = option("needs the size", forecast(0.0, 0.0, parameter=(50.0, -50.0)))
+    pair = choose(doubt(0.5, 0.5), [pins, needs], POLICY)
+    assert pair is not None
+    assert len(pair.forecasts) == 2
+    alone = settling_probability(pair.forecasts[:1], pair.doubt.odds, 0.95)
+    assert alone == 0.0  # both rivals allow the same numbers
+    assert settling_probability(pair.forecasts, pair.doubt.odds, 0.95) > 0.5

@@ -160,18 +160,8 @@ def _inexact(reading: SideTable, names: frozenset[str]) -> float:
         if any(row.unlisted & groups[name] for name in here):
             inexact += row.probability
         elif row.refitted:
-            inexact += row.probability * _large_form_error(reading.table.fits[row.members], row.unlisted)
+            inexact += row.probability * reading.table.fits[row.members].inexact
     return inexact / total if total > 0.0 else 0.0
-
-
-def _large_form_error(fit: FittedSet, unlisted: frozenset[int]) -> float:
-    """Return the probability that the form errors are above their declared tolerance, under one set."""
-    log = np.array([form.by_groups.get(unlisted, -np.inf) for form in fit.forms])
-    if not np.isfinite(log).any():
-        return 0.0
-    weight = np.exp(log - log.max())
-    large = np.array([form.form > 1.0 for form in fit.forms])
-    return float(weight[large].sum() / weight.sum())
 
 
 def _shared_groups(reading: SideTable, name: str) -> frozenset[int]:

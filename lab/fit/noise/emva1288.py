@@ -36,6 +36,7 @@ LARGEST_NONUNIFORMITY_PERCENT = 3.0
 #: Standard deviations of what rows or columns share, from which on it is reported: of 8 such numbers (four planes),
 #: one is beyond by chance in 0.03 % of all cameras.
 LINE_SIGMA = 4.0
+LEAST_PEAK = 0.3  # of the largest variance, from which on a maximum is that of saturation
 SPATIAL_IMAGES = 16  # with fewer, the row and column parts contain temporal noise; the standard asks for more
 
 
@@ -274,13 +275,14 @@ def _calibration(at: EmvaLevels, found: Figures, remarks: list[str]) -> dict[str
 def _saturation(at: EmvaLevels, given: EmvaInput, remarks: list[str]) -> tuple[float, int | None]:
     """Signal at the level of the largest variance, and its index; None where the flats don't exceed it.
 
-    The search goes from the brightest level down to the first maximum that two darker levels confirm.
+    The search goes from the brightest level down to the first maximum that two darker levels confirm, and that is no
+    scatter of levels beyond saturation, whose variance is that of the read-out at most.
     """
-    best, index = -np.inf, 0
+    best, index, least = -np.inf, 0, LEAST_PEAK * float(at.variance.max())
     for number in range(at.variance.size - 1, -1, -1):
         if at.variance[number] >= best:
             best, index = float(at.variance[number]), number
-        elif at.variance[max(number - 1, 0)] < best:
+        elif at.variance[max(number - 1, 0)] < best and best > least:
             break
     beyond = at.variance[index + 1 :]
     if beyond.size and beyond.min() < at.variance[index] - 3.0 * at.variance_std[index]:

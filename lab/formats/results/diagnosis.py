@@ -379,7 +379,8 @@ class Resolution(Frozen):
     `session` holds its frames; `verdict_before`, `effects_before`: the diagnosis before it. `rivals`, `rivals_after`:
     what was and what is in doubt, or the names that stand there; None while no diagnosis has said it yet. `then`: the
     capture that is planned after it, as only both together tell. `information_nat`: expected information of the capture
-    (of both), `expected_s` and `spent_s`: lab time that was expected and that it took.
+    (of both). `settles`: probability that one rival holds the threshold of a name afterwards. `expected_s` and
+    `spent_s`: lab time that was expected and that it took.
     """
 
     capture: str
@@ -390,6 +391,7 @@ class Resolution(Frozen):
     rivals: tuple[RivalOdds, ...] = ()
     then: str = ""
     information_nat: float | None = None
+    settles: float | None = None
     expected_s: float | None = None
     spent_s: float | None = None
     rivals_after: tuple[RivalOdds, ...] | None = None

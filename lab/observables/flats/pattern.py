@@ -42,6 +42,9 @@ POWER_FLOOR = 0.1
 DUST_STD, DUST_POWER = 2.0, 3.0
 #: Standard deviation of the share of charge or signal that each next pixel takes: it takes fine detail away.
 SHARED_STD = 0.05
+#: Chance of white noise, in each band, of a frequency's power from which on it counts as a tone, and the frequencies to
+#: either side that its window takes. Striped sensitivities, of one frequency and direction, are no rings.
+TONE_CHANCE, TONE_REACH, MOST_TONES = 1e-4, 2, 1
 #: Correlation of the amplitudes of white noise in a Hann window by their distance, in cycles a frame.
 WINDOW_CORRELATION = {-2: 1.0 / 6.0, -1: -2.0 / 3.0, 0: 1.0, 1: -2.0 / 3.0, 2: 1.0 / 6.0}
 
@@ -59,6 +62,7 @@ class _Part:
     own: float  # of the pixels' own pattern and noise
     fixed_share: float  # of `own` that isn't noise
     shape: tuple[int, int]  # of the plane
+    used: NDArray[np.bool_]  # frequencies of `rfft2` that aren't tones
 
 
 def measure_flat_pattern(dataset: Dataset) -> Observable:
@@ -122,12 +126,14 @@ def _of_flats(dataset: Dataset) -> list[_Part]:
     for held_out, (image, noise) in sorted(images.items()):
         captures = [c for level in levels if level.held_out == held_out for c in level.captures]
         plane = _plane(dataset, image)
-        power, own = _powers(plane)
+        used = _without_tones(plane)
+        power, own = _powers(plane, used)
         step = mosaic.step(dataset.camera.cfa)
         fixed = float(np.clip(1.0 - noise / step**2 / max(own, 1e-30), 0.0, 1.0))
         light = _light_of(dataset, captures[0])
         name = "all flats"
-        found.append(_Part(light, None, name, held_out, tuple(c.id for c in captures), power, own, fixed, plane.shape))
+        names = tuple(c.id for c in captures)
+        found.append(_Part(light, None, name, held_out, names, power, own, fixed, plane.shape, used))
     return found
 
 
@@ -151,10 +157,12 @@ def _of_infrared(dataset: Dataset) -> list[_Part]:
                 continue
             frames = (np.asarray(dataset.recordings.frame(c), float) - dark_level_dn(dataset, c) for c in captures)
             plane = _plane(dataset, sum(frames) / len(captures) / reference)
-            power, own = _powers(plane)
+            used = np.ones((plane.shape[0], plane.shape[1] // 2 + 1), bool)
+            power, own = _powers(plane, used)
             light, names = dataset.spectrum(captures[0].radiance), tuple(c.id for c in captures)
             name = f"{captures[0].wavelength_nm:g} nm over all flats"
-            found.append(_Part(light, _light_of(dataset, first), name, held_out, names, power, own, 0.0, plane.shape))
+            beside = _light_of(dataset, first)
+            found.append(_Part(light, beside, name, held_out, names, power, own, 0.0, plane.shape, used))
     return found
 
 
@@ -186,17 +194,43 @@ def _middle(count: int) -> slice:
     return slice((count - size) // 2, (count - size) // 2 + size)
 
 
-def _powers(plane: FloatArray) -> tuple[FloatArray, float]:
-    """Mean power in each of the bands, and in that of the pixels' own pattern: the variance of a pixel where pixels are
-    independent."""
+def _spectrum(plane: FloatArray) -> FloatArray:
+    """Power of a plane by frequency (`rfft2`), the variance of a pixel where pixels are independent; without surface
+    and means of lines."""
     down, across = (np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), LIGHT_DEGREE) for n in plane.shape)
     down, across = (np.linalg.qr(base)[0] for base in (down, across))
     rest = plane - down @ (down.T @ plane @ across) @ across.T
     rest = rest - rest.mean(axis=0) - rest.mean(axis=1)[:, None] + rest.mean()
     window = np.multiply.outer(*(1.0 - np.cos(2.0 * np.pi * (np.arange(n) + 0.5) / n) for n in plane.shape))
     window /= np.sqrt(np.mean(np.square(window)))
-    power = np.square(np.abs(np.fft.rfft2(rest * window))) / rest.size
-    *bands, own = (float(power[where].mean()) for where in _frequencies(plane.shape))
+    return np.asarray(np.square(np.abs(np.fft.rfft2(rest * window))) / rest.size)
+
+
+def _without_tones(plane: FloatArray) -> NDArray[np.bool_]:
+    """Return which frequencies are no tones: in each band, those are left out whose power exceeds what white noise of
+    the band's median has in one of 1 / `TONE_CHANCE` bands. Where there are more than `MOST_TONES`, as rings have
+    waves of many directions, none are."""
+    power = _spectrum(plane)
+    used = np.ones(power.shape, bool)
+    for band in _frequencies(plane.shape):
+        left = used.copy()
+        for _ in range(MOST_TONES + 1):
+            here = band & left
+            limit = np.median(power[here]) / np.log(2.0) * np.log(np.count_nonzero(here) / TONE_CHANCE)
+            row, col = np.unravel_index(int(np.argmax(np.where(here, power, 0.0))), power.shape)
+            if power[row, col] <= limit:
+                used = left
+                break
+            rows = np.arange(row - TONE_REACH, row + TONE_REACH + 1) % power.shape[0]
+            left[rows, max(int(col) - TONE_REACH, 0) : int(col) + TONE_REACH + 1] = False
+    return used
+
+
+def _powers(plane: FloatArray, used: NDArray[np.bool_]) -> tuple[FloatArray, float]:
+    """Mean power in each of the bands, and in that of the pixels' own pattern, of the frequencies that are used: the
+    variance of a pixel where pixels are independent."""
+    power = _spectrum(plane)
+    *bands, own = (float(power[band & used].mean()) for band in _frequencies(plane.shape))
     return np.array(bands), own
 
 
@@ -244,16 +278,16 @@ def _pattern_powers(dataset: Dataset, parts: Sequence[_Part], effects: Effects) 
         found = (model.pattern(channel, light, kind, x_um, y_um) for channel in known)
         return [one[_middle(len(row)), _middle(len(col))] for one in found]
 
-    @cache
-    def powers(light: Spectrum | None, reference: Spectrum | None) -> tuple[FloatArray, float]:
-        if light is None or not known:
-            return np.zeros(len(BAND_EDGES) - 1), 0.0
-        if reference is None:
-            return _powers(np.mean(of_light(light, "flat"), axis=0))
-        both = zip(of_light(light, "narrowband"), of_light(reference, "flat"), strict=True)
-        return _powers(np.mean([one / other for one, other in both], axis=0))
-
-    return [powers(part.light, part.reference) for part in parts]
+    found = []
+    for part in parts:
+        if part.light is None or not known:
+            found.append((np.zeros(len(BAND_EDGES) - 1), 0.0))
+        elif part.reference is None:
+            found.append(_powers(np.mean(of_light(part.light, "flat"), axis=0), part.used))
+        else:
+            both = zip(of_light(part.light, "narrowband"), of_light(part.reference, "flat"), strict=True)
+            found.append(_powers(np.mean([one / other for one, other in both], axis=0), part.used))
+    return found
 
 
 def _covariance(parts: Sequence[_Part]) -> FloatArray:

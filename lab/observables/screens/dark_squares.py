@@ -83,12 +83,14 @@ def measure_screen(dataset: Dataset) -> Observable:
     ids = [p.kind for p in points]
     same = np.array([[a == b for b in ids] for a in ids])
     white = np.array([p.white for p in points])
-    channel, digits = np.array([p.channel for p in points]), np.array([p.digits for p in points])
+    channel = np.array([p.channel for p in points])
+    # seen and held-out repeats have the dark screen's frames, and their rounding, in common
+    fixed = np.array([np.hypot(p.digits, p.black_std) for p in points])
     covariance += (
         same * np.outer(tail, tail) * dataset.tail_std**2
         + np.outer(beyond, beyond)
         + np.diag(np.square(1e-4 * white))
-        + same * (channel[:, None] == channel) * np.outer(digits, digits)
+        + same * (channel[:, None] == channel) * np.outer(fixed, fixed)
     )
 
     def predict(effects: Effects) -> Prediction:
@@ -166,7 +168,8 @@ class _DarkSquares:
     captures: tuple[str, ...]
     held_out: bool
     value: float  # mean level less that of the dark screen
-    std: float  # of `value` by shot and read noise
+    std: float  # of `value` by shot and read noise of the pattern's repeats
+    black_std: float  # the same by that of the dark screen's
     tail: float  # predicted level by the baseline's point spread function
     picture: FloatArray  # pattern less dark screen, one plane of the mosaic
     use: NDArray[np.bool_]  # mask of the dark squares' pixels in it
@@ -240,11 +243,11 @@ def _dark_squares(
         added = (shown - black)[plane]
         difference = added[use]
         lights = np.maximum([float(frame[plane][use].mean()) - noise.black for frame in (shown, black)], 0.0)
-        variance = (noise.gain * lights[1] + noise.read_dn**2) * (1 / len(part) + 1 / blacks)
+        variances = (noise.gain * lights + noise.read_dn**2) / np.array([len(part), blacks]) / use.sum()
         means = [float(channel_pixels(f, dataset.camera.cfa, channel).mean()) for f in (shown, black)]
         found.append(
             _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
-                         float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),
+                         float(np.sqrt(variances[0])), float(np.sqrt(variances[1])), 0.5 * float(ends + endless),
                          added, use, Surroundings.of(harmonics(added), use), reach, 0.5 * float(endless - ends),
                          means[0] - means[1], float(full[bright].mean()),
                          float(black[plane][use].mean()) - noise.black,

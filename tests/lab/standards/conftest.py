@@ -17,15 +17,24 @@ EDGE_E = (1000.0, 4000.0)
 EDGE_SIGMA_PX = 0.9
 
 
-def _codes(rng: np.random.Generator, electrons: np.ndarray) -> np.ndarray:
-    noisy = rng.poisson(np.minimum(electrons, FULL_E)) + READ_E * rng.standard_normal((ROWS, COLS))
+def _codes(rng: np.random.Generator, electrons: np.ndarray, variance_loss: float) -> np.ndarray:
+    mean = np.minimum(electrons, FULL_E)
+    if variance_loss:
+        # pixels of thousands of electrons: normal, of a variance that falls behind the mean's as charge repels charge
+        shot = np.sqrt(mean * (1.0 - variance_loss * mean / FULL_E)) * rng.standard_normal((ROWS, COLS))
+    else:
+        shot = rng.poisson(mean) - mean
+    noisy = mean + shot + READ_E * rng.standard_normal((ROWS, COLS))
     return np.clip(np.rint(BLACK + GAIN * np.minimum(noisy, FULL_E)), 0, 3800).astype(np.uint16)
 
 
-def mono_set(falloff: float = 0.0, levels: int = 12, repeats: int = 4, seed: int = 1) -> RecordingSet:
+def mono_set(
+    falloff: float = 0.0, levels: int = 12, repeats: int = 4, seed: int = 1, variance_loss: float = 0.0
+) -> RecordingSet:
     """Return a set of `levels` from 2 % of saturation to beyond it, in `repeats`, darks and one edge.
 
-    `falloff`: by how much the light of the flats is lower in the corners than in the middle.
+    `falloff`: by how much the light of the flats is lower in the corners than in the middle. `variance_loss`: of the
+    shot noise's variance at saturation, as the brighter-fatter effect has it.
     """
     rng = np.random.default_rng(seed)
     pattern = 1.0 + PRNU * rng.standard_normal((ROWS, COLS))
@@ -37,7 +46,7 @@ def mono_set(falloff: float = 0.0, levels: int = 12, repeats: int = 4, seed: int
 
     def add(kind: str, electrons: np.ndarray, exposure_s: float, **keys: object) -> None:
         name = f"{kind}-{len(captures):03d}"
-        frames[f"frames/{name}.npy"] = _codes(rng, electrons)
+        frames[f"frames/{name}.npy"] = _codes(rng, electrons, variance_loss)
         captures.append(
             {"id": name, "kind": kind, "side": "left", "frame": f"frames/{name}.npy", "exposure_s": exposure_s} | keys
         )

@@ -87,8 +87,9 @@ def test_intervals_hold() -> None:
 def test_dark_alone_is_refused() -> None:
     light = np.linspace(0.0, 1e-3, 8)
     curve = camera(light, 0.3 * light, 0.1 * light, FULL, None)
-    with pytest.raises(NotDetermined, match="above 1; expose longer"):
-        curve.threshold()
+    for figure in (curve.threshold, curve.saturation):
+        with pytest.raises(NotDetermined, match="above 1; expose longer"):
+            figure()
 
 
 def test_saturation_is_found_by_codes_by_levels_and_by_noise() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -10,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.capture_kinds.flat import FlatCapture
 from lab.cli import main
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet, write
 from lab.formats.results import FitResult, StandardReading, StandardsResult
 from lab.report.standards import file_name, sections, write_standards
-from lab.report.standards_pdf import write_standards_pdf
+from lab.report.standards_pdf import has_matplotlib, write_standards_pdf
 from lab.standards.reading import STANDARDS, read_standards
 from lab.standards.standard import Figure, Standard
 from tests.lab.standards.conftest import EDGE_SIGMA_PX, EFFICIENCY, FULL_E, GAIN, READ_E
@@ -118,6 +118,54 @@ def test_light_that_falls_off_by_a_quarter_is_told(make_mono_set: Callable[..., 
     assert not any(one.quantity.startswith("nonuniformity") for one in of(even, reading.standard).deviations)
 
 
+def test_level_whose_light_is_misstated_is_left_out(make_mono_set: Callable[..., RecordingSet]) -> None:
+    """One level states ten times its photons: the fit reports it, and no slope rests on it."""
+    recordings = make_mono_set(seed=3)
+    flats = recordings.captures(FlatCapture, "left")
+    wrong = {flat.id for flat in flats if flat.exposure_s == flats[16].exposure_s}
+    captures = tuple(
+        one.model_copy(update={"photons_per_pixel": 10.0 * one.photons_per_pixel}) if one.id in wrong else one
+        for one in recordings.captures()
+    )
+    misstated = recordings.under(recordings.manifest.model_copy(update={"captures": captures}))
+    fit = fit_recording_set(misstated)
+    made = misstated, fit, read_standards(misstated, fit)
+    found = {one.name: one.estimate for one in of(made, "EMVA 1288 R4.0 General").figures}
+    slope = found["nonlinearity"]
+    assert slope is not None
+    assert abs(slope.value - 1.0) < 3.5 * (slope.std or 0.0)
+    ratio = next(one.estimate for one in of(made, "ISO 15739:2023").figures if one.name == "fixed_pattern_snr")
+    assert ratio is not None
+    assert abs(ratio.value - 100.0) < 3.5 * (ratio.std or 0.0)
+
+
+def test_bias_of_the_gain_under_brighter_fatter_is_that_of_the_line_and_is_told(
+    make_mono_set: Callable[..., RecordingSet],
+) -> None:
+    """Of a variance K x (1 - a x), the standard's line through the origin over levels x_i has K (1 - a sum x^3 / sum
+    x^2). The page states the difference from the slope at zero signal of the joint fit, which is K."""
+    loss = 0.1
+    recordings = make_mono_set(levels=20, seed=4, variance_loss=loss)
+    fit = fit_recording_set(recordings)
+    reading = of((recordings, fit, read_standards(recordings, fit)), "EMVA 1288 R4.0 Linear")
+    noise = fit.cameras["left"].noise
+    assert noise is not None
+    shares = np.linspace(0.02, 0.9, 18)
+    used = shares[shares <= 0.7 * 0.9]  # the largest variance is that of the level of 0.9
+    expected = GAIN * (1.0 - loss * np.sum(used**3) / np.sum(used**2))
+    assert 1.0 - expected / GAIN > 0.03
+    line = next(one.estimate for one in reading.figures if one.name == "system_gain")
+    assert line is not None
+    # 6144 pixels, 3 degrees of freedom each: a variance to 1.0 %, the slope of 12 levels, the brighter ones mostly, to
+    # 0.4 %
+    assert line.value == pytest.approx(expected, rel=3.5 * 0.004)
+    at_zero, std = noise.conversion_gain_at_zero_dn_per_e, noise.conversion_gain_at_zero_dn_per_e_std
+    assert at_zero is not None
+    assert std is not None
+    assert abs(at_zero - GAIN) < 3.5 * std
+    assert any("brighter-fatter effect bend" in line for line in reading.remarks)
+
+
 def test_few_levels_and_images_are_told(even: Made) -> None:
     lines = [one.line for one in of(even, "EMVA 1288 R4.0 Linear").deviations]
     assert any(line.startswith("levels of light: 12; the standard asks for 50 at least") for line in lines)
@@ -169,13 +217,29 @@ def test_command(
 
 @pytest.mark.extra
 def test_pdf_holds_all_pages(even: Made, tmp_path: Path) -> None:
-    if importlib.util.find_spec("matplotlib") is None:
+    if not has_matplotlib():
         missing("matplotlib isn't installed; `make peers` installs it")
     recordings, fit, result = even
     found = sections(result, recordings, fit)
     file = write_standards_pdf(tmp_path / "all.pdf", result, found, "known camera")
     data = file.read_bytes()
     assert data.startswith(b"%PDF")
-    # an overview, and for each standard its text and its pictures, six a page
-    least = 1 + sum(1 + -(-len(one.pictures) // 6) for one in found)
+    # an overview, and a page at least for each standard; three rows of two pictures fill one
+    least = 1 + sum(max(1, len(one.pictures) // 6) for one in found)
     assert data.count(b"/Type /Page ") + data.count(b"/Type /Page\n") >= least
+
+
+def test_pdf_without_matplotlib_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("lab.report.standards_pdf.has_matplotlib", lambda: False)
+    assert main(["standards", str(tmp_path / "nothing"), "--pdf", str(tmp_path / "all.pdf")]) == 2
+    assert "pip install 'calibench[pdf]'" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("option", ["--resolve", "--only=dark", "--set=dark.frames=3"])
+def test_session_of_the_standards_takes_no_other_plan(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", "--standards", "--out", str(tmp_path), option]) == 2
+    assert "--standards: takes its own sequences and no diagnosis" in " ".join(capsys.readouterr().err.split())

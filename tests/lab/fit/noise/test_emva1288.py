@@ -150,3 +150,19 @@ def test_rounding_hides_the_dark_noise() -> None:
     assert found.temporal_dark_noise_e is None
     assert found.temporal_dark_noise_limit_e == pytest.approx(0.40 / found.system_gain_dn_per_e)
     assert found.sensitivity_threshold_e is None
+
+
+def test_scatter_beyond_saturation_is_no_maximum() -> None:
+    """Six levels at the full well, whose variances scatter: saturation is at the last level before them."""
+    rng = np.random.default_rng(6)
+    lights = [*np.linspace(0.1, 0.97, 10), 1.2, 1.4, 1.8, 2.4, 3.2, 4.5]
+    levels: dict[str, list[MeasuredLevel]] = {"dark": [], "flat": []}
+    for light in lights:
+        for kind in ("dark", "flat"):
+            charge = np.minimum(rng.poisson(np.full((2, *SHAPE), FULL * light if kind == "flat" else 0.0)), FULL)
+            codes = np.rint(BLACK + GAIN * (charge + READ * rng.standard_normal((2, *SHAPE)))).astype(np.uint16)
+            photons = FULL * light / EFFICIENCY if kind == "flat" else 0.0
+            levels[kind].append(MeasuredLevel(light, photons, kind, level_statistics(codes, "MONO", 4095)))
+    found = emva1288_figures(EmvaInput("Y", tuple(levels["dark"]), tuple(levels["flat"]), True, 550.0, 2400.0))
+    assert not isinstance(found, str)
+    assert found.saturation_capacity_photons == pytest.approx(0.97 * FULL / EFFICIENCY)
