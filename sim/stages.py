@@ -164,7 +164,7 @@ LEAST_SHARE = 1e-5
 
 
 @dataclass(frozen=True)
-class Pattern:
+class GainPattern:
     """Sensitivity that differs over a frame by a coordinate of its own, such as a layer's thickness. `coordinate`:
     (x_um, y_um) -> its value; `factor`: (wavelength_nm, coordinate), which broadcast -> factor. `is_grey`: it is the
     same for all wavelengths.
@@ -210,7 +210,7 @@ class Image(State):
     shading: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     shift: tuple[Callable[[FloatArray, FloatArray, float], tuple[FloatArray, FloatArray]], ...] = ()
     copies: tuple[Callable[[FloatArray], FloatArray], ...] = ()
-    patterns: tuple[Pattern, ...] = ()
+    patterns: tuple[GainPattern, ...] = ()
 
     def transmit(self, wavelength_nm: FloatArray, sin_theta: FloatArray | float) -> FloatArray:
         """Factor on the light by wavelength and sine of the chief ray's angle at the sensor, which broadcast."""

@@ -80,7 +80,7 @@ class ChartSequence(Sequence):
         target = station.list_targets(ChartTarget)[name]
         lit, stem = Setting(target=name, wavelength_nm=0.0), "colorchecker"
         if self.lamp_level:
-            lit = Setting(target=name, lamp=lamp_channels(station, self.lamp_level, self.colour_temperature_k))
+            lit = Setting(target=name, lamp=lamp_channels(station.lights, self.lamp_level, self.colour_temperature_k))
             stem = f"{stem}/{lamp_words(self.lamp_level, self.colour_temperature_k)}"
         made = [exposure_step(stem, "ColorChecker", lit, self.level)]
         light = spectrum_path(made[0].id)

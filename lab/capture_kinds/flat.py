@@ -136,7 +136,7 @@ class FlatSequence(Sequence):
         stem, what = f"flat/{self.wavelength_nm:g}nm" if self.wavelength_nm else "flat", "flat field"
         sphere = station.one(SphereTarget)
         if self.lamp_level:
-            channels = lamp_channels(station, self.lamp_level, self.colour_temperature_k, self.wavelength_nm)
+            channels = lamp_channels(station.lights, self.lamp_level, self.colour_temperature_k, self.wavelength_nm)
             lit = Setting(target=sphere, lamp=channels, gain_db=gain_db)
             stem = f"{stem}/{lamp_words(self.lamp_level, self.colour_temperature_k)}"
         else:

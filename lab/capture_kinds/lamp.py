@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Self
+from collections.abc import Mapping
+from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
 from lab.errors import InputError
 from sim.parameters import Frozen, Quantity
-
-if TYPE_CHECKING:
-    from lab.capture_kinds.base import Equipment
 
 LampLevel = Annotated[
     float,
@@ -58,24 +56,24 @@ def check_lamp(level: float, colour_temperature_k: float | None) -> None:
 
 
 def lamp_channels(
-    station: Equipment, level: float, colour_temperature_k: float | None, wavelength_nm: float = 0.0
+    lights: Mapping[str, LampLight], level: float, colour_temperature_k: float | None, wavelength_nm: float = 0.0
 ) -> dict[str, float]:
-    """Return the share 0..1 of its most at which each channel is to be lit, for `level` times a light of the station.
+    """Return the share 0..1 of its most at which each channel is to be lit, for `level` times one of a
+    station's `lights`, by name.
 
     The light is that of `colour_temperature_k` (K), or of `wavelength_nm` (nm); with neither (None, 0), the first of
     the station file. Raises InputError where there is none.
     """
-    every = station.lights
     if colour_temperature_k is not None:
-        fit = [one for one in every.values() if one.colour_temperature_k == colour_temperature_k]
+        fit = [one for one in lights.values() if one.colour_temperature_k == colour_temperature_k]
         wanted = f"colour_temperature_k = {colour_temperature_k:g}"
-        have = [f"{one.colour_temperature_k:g} K" for one in every.values() if one.colour_temperature_k is not None]
+        have = [f"{one.colour_temperature_k:g} K" for one in lights.values() if one.colour_temperature_k is not None]
     elif wavelength_nm:
-        fit = [one for one in every.values() if one.wavelength_nm == wavelength_nm]
+        fit = [one for one in lights.values() if one.wavelength_nm == wavelength_nm]
         wanted = f"wavelength_nm = {wavelength_nm:g}"
-        have = [f"{one.wavelength_nm:g} nm" for one in every.values() if one.wavelength_nm is not None]
+        have = [f"{one.wavelength_nm:g} nm" for one in lights.values() if one.wavelength_nm is not None]
     else:
-        fit, wanted, have = list(every.values()), "any colour", []
+        fit, wanted, have = list(lights.values()), "any colour", []
     if not fit:
         raise InputError(
             f"station: [light_source.lights] has no light of {wanted}; it has {', '.join(have) or 'none'}: ask for one "

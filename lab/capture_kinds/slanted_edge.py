@@ -168,7 +168,7 @@ def edge_steps(
         by_hand=by_hand,
     )
     if sequence.lamp_level:
-        channels = lamp_channels(station, sequence.lamp_level, sequence.colour_temperature_k, light_nm)
+        channels = lamp_channels(station.lights, sequence.lamp_level, sequence.colour_temperature_k, light_nm)
         usual = Setting(target=None, by_hand=by_hand, lamp=channels)
     made: list[Step] = []
     for name in sequence.edges or there:

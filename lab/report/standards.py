@@ -56,7 +56,7 @@ class StandardsPicture:
 
 
 @dataclass(frozen=True)
-class FigureRow:
+class StandardRow:
     """One figure of a standard in a table: a text a subject; `marks`: whether each is by the standard."""
 
     figure: StandardFigure
@@ -70,7 +70,7 @@ class FigureTable:
     """Figures of subjects that stand beside each other."""
 
     subjects: tuple[str, ...]
-    rows: tuple[FigureRow, ...]
+    rows: tuple[StandardRow, ...]
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def _tables(readings: Sequence[StandardReading]) -> Iterator[FigureTable]:
             for each in zip(*(reading.figures for reading in part), strict=True):
                 reasons = dict.fromkeys(one.reason for one in each if one.reason)
                 rows.append(
-                    FigureRow(
+                    StandardRow(
                         figure=each[0],
                         values=tuple(_value(one) for one in each),
                         marks=tuple(one.by_the_standard for one in each),

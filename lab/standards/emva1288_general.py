@@ -26,7 +26,7 @@ from lab.observables.codes.rounding import QUANTISATION_DN2
 from lab.observables.noise.stack import PlaneStatistics
 from lab.observables.weighted_lines import dark_line
 from lab.standards.emva1288_linear import level_deviations, uniformity_deviations
-from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
+from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 from lab.standards.tone_steps import level_series, repeated_mean_std, slope_weights
 from sim.spectrum import FloatArray
 
@@ -186,7 +186,7 @@ class Emva1288General(Standard):
             raise NotDetermined(self.name, "the flats state no photons: measure the irradiance, or state it")
         return Estimate(value=value, std=std, unit="photons")
 
-    @Figure
+    @ClauseFigure
     def snr_max(self) -> Estimate:
         """Return the maximum input signal-to-noise ratio.
 
@@ -201,7 +201,7 @@ class Emva1288General(Standard):
             value=float(20.0 * np.log10(value)), std=float(DECIBEL * self.curve.snr_std[top] / value), unit="dB"
         )
 
-    @Figure
+    @ClauseFigure
     def total_snr_max(self) -> Estimate:
         """Return the maximum input signal-to-noise ratio with nonuniformity.
 
@@ -215,7 +215,7 @@ class Emva1288General(Standard):
         relative = self.curve.slope_std[top] / self.curve.slope[top]
         return Estimate(value=float(20.0 * np.log10(ratio[top])), std=float(DECIBEL * relative), unit="dB")
 
-    @Figure
+    @ClauseFigure
     def sensitivity_threshold(self) -> Estimate:
         """Return the absolute sensitivity threshold.
 
@@ -224,7 +224,7 @@ class Emva1288General(Standard):
         """
         return self._in_photons(*self.curve.threshold())
 
-    @Figure
+    @ClauseFigure
     def saturation_irradiation(self) -> Estimate:
         """Return the saturation irradiation.
 
@@ -233,7 +233,7 @@ class Emva1288General(Standard):
         """
         return self._in_photons(*self.curve.saturation())
 
-    @Figure
+    @ClauseFigure
     def dynamic_range(self) -> Estimate:
         """Return the dynamic range.
 
@@ -244,7 +244,7 @@ class Emva1288General(Standard):
         std = DECIBEL * float(np.hypot(low_std / low, high_std / high))
         return Estimate(value=float(20.0 * np.log10(high / low)), std=std, unit="dB")
 
-    @Figure
+    @ClauseFigure
     def nonlinearity(self) -> Estimate:
         """Return the change of the slope over the range.
 

@@ -15,7 +15,7 @@ from lab.formats.results import Emva1288
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation
 from lab.formats.results.words import measured
-from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
+from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 
 LEAST_LEVELS = 50
 LEAST_STACK_IMAGES = 16
@@ -96,7 +96,7 @@ class Emva1288Linear(Standard):
         std = None if ratio.std is None else 20.0 / np.log(10.0) * ratio.std / ratio.value
         return Estimate(value=float(20.0 * np.log10(ratio.value)), std=std, unit="dB")
 
-    @Figure
+    @ClauseFigure
     def quantum_efficiency(self) -> Estimate:
         """Return the quantum efficiency.
 
@@ -105,7 +105,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("quantum_efficiency", "%", 100.0)
 
-    @Figure
+    @ClauseFigure
     def responsivity(self) -> Estimate:
         """Return the responsivity.
 
@@ -114,7 +114,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("responsivity_dn_per_photon", "DN/photon")
 
-    @Figure
+    @ClauseFigure
     def system_gain(self) -> Estimate:
         """Return the overall system gain.
 
@@ -123,7 +123,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("system_gain_dn_per_e", "DN/e")
 
-    @Figure
+    @ClauseFigure
     def temporal_dark_noise(self) -> Estimate:
         """Return the temporal dark noise.
 
@@ -132,7 +132,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("temporal_dark_noise_e", "e")
 
-    @Figure
+    @ClauseFigure
     def temporal_dark_noise_output(self) -> Estimate:
         """Return the temporal dark noise of the digital signal.
 
@@ -141,7 +141,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("temporal_dark_noise_dn", "DN")
 
-    @Figure
+    @ClauseFigure
     def snr_max(self) -> Estimate:
         """Return the maximum signal-to-noise ratio.
 
@@ -150,7 +150,7 @@ class Emva1288Linear(Standard):
         """
         return self._decibels("snr_max")
 
-    @Figure
+    @ClauseFigure
     def sensitivity_threshold_photons(self) -> Estimate:
         """Return the absolute sensitivity threshold in photons.
 
@@ -159,7 +159,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("sensitivity_threshold_photons", "photons")
 
-    @Figure
+    @ClauseFigure
     def sensitivity_threshold(self) -> Estimate:
         """Return the absolute sensitivity threshold in electrons.
 
@@ -168,7 +168,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("sensitivity_threshold_e", "e")
 
-    @Figure
+    @ClauseFigure
     def saturation_capacity_photons(self) -> Estimate:
         """Return the saturation capacity in photons.
 
@@ -177,7 +177,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("saturation_capacity_photons", "photons")
 
-    @Figure
+    @ClauseFigure
     def saturation_capacity(self) -> Estimate:
         """Return the saturation capacity in electrons.
 
@@ -186,7 +186,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("saturation_capacity_e", "e")
 
-    @Figure
+    @ClauseFigure
     def dynamic_range(self) -> Estimate:
         """Return the dynamic range.
 
@@ -195,7 +195,7 @@ class Emva1288Linear(Standard):
         """
         return self._decibels("dynamic_range")
 
-    @Figure
+    @ClauseFigure
     def linearity_error(self) -> Estimate:
         """Return the linearity error.
 
@@ -205,7 +205,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("linearity_error_percent", "%")
 
-    @Figure
+    @ClauseFigure
     def dark_current_from_mean(self) -> Estimate:
         """Return the dark current from means.
 
@@ -214,7 +214,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("dark_current_from_mean_e_per_s", "e/s")
 
-    @Figure
+    @ClauseFigure
     def dark_current_from_variance(self) -> Estimate:
         """Return the dark current from variances.
 
@@ -223,7 +223,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("dark_current_from_variance_e_per_s", "e/s")
 
-    @Figure
+    @ClauseFigure
     def dsnu(self) -> Estimate:
         """Return the dark signal nonuniformity.
 
@@ -232,7 +232,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("dsnu_e", "e")
 
-    @Figure
+    @ClauseFigure
     def row_dsnu(self) -> Estimate:
         """Return the row part of the dark signal nonuniformity.
 
@@ -241,7 +241,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("dsnu_row_e", "e")
 
-    @Figure
+    @ClauseFigure
     def column_dsnu(self) -> Estimate:
         """Return the column part of the dark signal nonuniformity.
 
@@ -250,7 +250,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("dsnu_column_e", "e")
 
-    @Figure
+    @ClauseFigure
     def pixel_dsnu(self) -> Estimate:
         """Return the pixel part of the dark signal nonuniformity.
 
@@ -259,7 +259,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("dsnu_pixel_e", "e")
 
-    @Figure
+    @ClauseFigure
     def prnu(self) -> Estimate:
         """Return the photo response nonuniformity.
 
@@ -268,7 +268,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("prnu_percent", "%")
 
-    @Figure
+    @ClauseFigure
     def row_prnu(self) -> Estimate:
         """Return the row part of the photo response nonuniformity.
 
@@ -277,7 +277,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("prnu_row_percent", "%")
 
-    @Figure
+    @ClauseFigure
     def column_prnu(self) -> Estimate:
         """Return the column part of the photo response nonuniformity.
 
@@ -286,7 +286,7 @@ class Emva1288Linear(Standard):
         """
         return self._of("prnu_column_percent", "%")
 
-    @Figure
+    @ClauseFigure
     def pixel_prnu(self) -> Estimate:
         """Return the pixel part of the photo response nonuniformity.
 

@@ -18,7 +18,7 @@ from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, PlotCurve, StandardPlot
 from lab.observables.edges.finding import Array
 from lab.standards.iso12233 import EdgeRecord, edge_records
-from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
+from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 
 #: Contrast sensitivity a f^c exp(-b f) / K, f in cycles per degree.
 CSF_A, CSF_B, CSF_C, CSF_K = 75.0, 0.2, 0.8, 34.05
@@ -114,7 +114,7 @@ class Ieee1858(Standard):
             raise NotDetermined(self.name, "the response of the edge isn't finite")
         return Estimate(value=value, std=std, unit="1")
 
-    @Figure
+    @ClauseFigure
     def screen_acutance(self) -> Estimate:
         """Return the acutance on a screen at 100 %.
 
@@ -123,7 +123,7 @@ class Ieee1858(Standard):
         """
         return self._acutance(SCREEN)
 
-    @Figure
+    @ClauseFigure
     def print_acutance(self) -> Estimate:
         """Return the acutance of a print.
 
@@ -132,7 +132,7 @@ class Ieee1858(Standard):
         """
         return self._acutance(PRINT)
 
-    @Figure
+    @ClauseFigure
     def television_acutance(self) -> Estimate:
         """Return the acutance on a television set.
 

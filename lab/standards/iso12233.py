@@ -32,7 +32,7 @@ from lab.observables.edges.measured import edges_of, measure_edge
 from lab.observables.edges.mtf import EdgeMtf, read_mtf
 from lab.observables.edges.profile import EdgeSummary
 from lab.observables.edges.region import check_phases
-from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
+from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 from sim.spectrum import FloatArray
 
 Window = Literal["tukey", "hamming"]
@@ -289,7 +289,7 @@ class Iso12233(Standard):
         value, std = pair
         return Estimate(value=value / self.edge.pitch_px, std=std / self.edge.pitch_px, unit="cy/px")
 
-    @Figure
+    @ClauseFigure
     def sfr50(self) -> Estimate:
         """Return the frequency of 50 % response.
 
@@ -298,7 +298,7 @@ class Iso12233(Standard):
         """
         return self._frequency(self.letter.falls_to(0.5))
 
-    @Figure
+    @ClauseFigure
     def sfr10(self) -> Estimate:
         """Return the limiting resolution.
 
@@ -307,7 +307,7 @@ class Iso12233(Standard):
         """
         return self._frequency(self.letter.falls_to(0.1))
 
-    @Figure
+    @ClauseFigure
     def sfr_at_half_nyquist(self) -> Estimate:
         """Return the response at half the Nyquist frequency.
 
@@ -317,7 +317,7 @@ class Iso12233(Standard):
         value, std = self.letter.at(0.25)
         return Estimate(value=value, std=std, unit="1")
 
-    @Figure
+    @ClauseFigure
     def edge_angle(self) -> Estimate:
         """Return the angle of the edge from the nearer axis of the pixels.
 
@@ -327,7 +327,7 @@ class Iso12233(Standard):
         angle = abs((self.edge.summary.angle_deg + 45.0) % 90.0 - 45.0)
         return Estimate(value=angle, std=self.edge.summary.angle_deg_std, unit="deg")
 
-    @Figure
+    @ClauseFigure
     def unbiased_mtf50(self) -> Estimate:
         """Return the unbiased estimate of the frequency of 50 % response.
 
@@ -339,7 +339,7 @@ class Iso12233(Standard):
             raise NotDetermined(self.name, "the response doesn't fall to 50 %")
         return Estimate(value=found.mtf50_cy_per_px, std=found.mtf50_cy_per_px_std, unit="cy/px")
 
-    @Figure
+    @ClauseFigure
     def sfr50_bias(self) -> Estimate:
         """Return the difference of the standard's estimate from the unbiased one.
 
@@ -482,7 +482,7 @@ class Iso12233Field(Standard):
             0.5 * float(np.hypot(camera.rows, camera.cols))
         )
 
-    @Figure
+    @ClauseFigure
     def centre_sfr50(self) -> Estimate:
         """Return the mean frequency of 50 % response in the centre.
 
@@ -494,7 +494,7 @@ class Iso12233Field(Standard):
             raise NotDetermined(self.name, "no edge within 0.3 of the half diagonal")
         return self._weighted(chosen)
 
-    @Figure
+    @ClauseFigure
     def corner_sfr50(self) -> Estimate:
         """Return the mean frequency of 50 % response in the corners.
 
@@ -506,7 +506,7 @@ class Iso12233Field(Standard):
             raise NotDetermined(self.name, "no edge beyond 0.7 of the half diagonal")
         return self._weighted(chosen)
 
-    @Figure
+    @ClauseFigure
     def lowest_sfr50(self) -> Estimate:
         """Return the lowest frequency of 50 % response.
 

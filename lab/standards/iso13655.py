@@ -17,7 +17,7 @@ from lab.errors import NotDetermined
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, PlotCurve, StandardPlot
 from lab.standards.iso17321 import GRID_NM, Colorimetry
-from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
+from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 from sim.scene.light import colour_science, luminance_cd_m2
 from sim.spectrum import Spectrum
 
@@ -62,7 +62,7 @@ class Iso13655(Standard):
             found.append(np.asarray(colour.XYZ_to_xy(white)))
         return found
 
-    @Figure
+    @ClauseFigure
     def luminance(self) -> Estimate:
         """Return the luminance.
 
@@ -71,7 +71,7 @@ class Iso13655(Standard):
         """
         return self._mean([luminance_cd_m2(one) for one in self.spectra], "cd/m²")
 
-    @Figure
+    @ClauseFigure
     def chromaticity_x(self) -> Estimate:
         """Return the chromaticity coordinate x.
 
@@ -80,7 +80,7 @@ class Iso13655(Standard):
         """
         return self._mean([float(one[0]) for one in self._chromaticities()], "1")
 
-    @Figure
+    @ClauseFigure
     def chromaticity_y(self) -> Estimate:
         """Return the chromaticity coordinate y.
 
@@ -89,7 +89,7 @@ class Iso13655(Standard):
         """
         return self._mean([float(one[1]) for one in self._chromaticities()], "1")
 
-    @Figure
+    @ClauseFigure
     def colour_temperature(self) -> Estimate:
         """Return the correlated colour temperature.
 

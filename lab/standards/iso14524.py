@@ -11,7 +11,7 @@ from lab.errors import NotDetermined
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, PlotCurve, StandardPlot
 from lab.formats.results.words import measured
-from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
+from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 from lab.standards.tone_steps import ToneSteps, tone_steps
 
 LEAST_STEPS = 12
@@ -44,7 +44,7 @@ class Iso14524(Standard):
         super().__init__(side, f"plane {steps.plane}")
         self.steps = steps
 
-    @Figure
+    @ClauseFigure
     def oecf_slope(self) -> Estimate:
         """Return the slope of the logarithmic OECF.
 
@@ -62,7 +62,7 @@ class Iso14524(Standard):
         std = float(np.hypot(*(steps.signal_std[k] / steps.signal[k] for k in (low, high)))) / span
         return Estimate(value=value, std=std, unit="1")
 
-    @Figure
+    @ClauseFigure
     def incremental_gain(self) -> Estimate:
         """Return the incremental gain at 18 % of saturation.
 
@@ -74,7 +74,7 @@ class Iso14524(Standard):
         gain, std = steps.gain
         return Estimate(value=float(steps.exposure[k] * gain[k]), std=float(steps.exposure[k] * std[k]), unit="DN")
 
-    @Figure
+    @ClauseFigure
     def saturation_level(self) -> Estimate:
         """Return the largest output above the dark.
 
@@ -84,7 +84,7 @@ class Iso14524(Standard):
         k = int(np.argmax(self.steps.signal))
         return Estimate(value=float(self.steps.signal[k]), std=float(self.steps.signal_std[k]), unit="DN")
 
-    @Figure
+    @ClauseFigure
     def saturation_ratio(self) -> Estimate:
         """Return the range of exposure that the function covers.
 

@@ -12,7 +12,7 @@ from lab.errors import NotDetermined
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, PlotCurve, StandardPlot
 from lab.formats.results.words import measured
-from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
+from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 from lab.standards.tone_steps import ToneSteps, tone_steps
 
 LEAST_IMAGES = 8
@@ -73,7 +73,7 @@ class Iso15739(Standard):
             value=value, std=value * float(np.hypot(signal_std / signal, 0.5 * square_std / square)), unit="1"
         )
 
-    @Figure
+    @ClauseFigure
     def total_snr(self) -> Estimate:
         """Return the signal-to-total-noise ratio.
 
@@ -83,7 +83,7 @@ class Iso15739(Standard):
         steps = self.steps
         return self._ratio(steps.temporal + steps.fixed, np.hypot(steps.temporal_std, steps.fixed_std))
 
-    @Figure
+    @ClauseFigure
     def temporal_snr(self) -> Estimate:
         """Return the signal-to-temporal-noise ratio.
 
@@ -92,7 +92,7 @@ class Iso15739(Standard):
         """
         return self._ratio(self.steps.temporal, self.steps.temporal_std)
 
-    @Figure
+    @ClauseFigure
     def fixed_pattern_snr(self) -> Estimate:
         """Return the signal-to-fixed-pattern-noise ratio.
 
@@ -101,7 +101,7 @@ class Iso15739(Standard):
         """
         return self._ratio(self.steps.fixed, self.steps.fixed_std)
 
-    @Figure
+    @ClauseFigure
     def black_temporal_noise(self) -> Estimate:
         """Return the temporal noise of the dark.
 
@@ -114,7 +114,7 @@ class Iso15739(Standard):
             raise NotDetermined(self.name, "the dark has no temporal noise: it is clipped or rounded away")
         return Estimate(value=noise, std=0.5 * dark.temporal_variance_std / noise, unit="DN")
 
-    @Figure
+    @ClauseFigure
     def dynamic_range(self) -> Estimate:
         """Return the dynamic range.
 

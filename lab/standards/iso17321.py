@@ -23,7 +23,7 @@ from lab.formats.results import SpectralFit
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation
 from lab.observables.charts.patches import patch_covariance, patch_levels
-from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
+from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 from sim.scene.colorchecker import reflectances
 from sim.scene.light import colour_science
 from sim.spectrum import FloatArray, Spectrum
@@ -148,7 +148,7 @@ class Iso17321(Standard):
         own, drawn = getattr(self.fitted, name), np.array([getattr(one, name) for one in self.drawn])
         return Estimate(value=float(2.0 * own - drawn.mean()), std=float(drawn.std(ddof=1)), unit="1")
 
-    @Figure
+    @ClauseFigure
     def smi(self) -> Estimate:
         """Return the sensitivity metamerism index.
 
@@ -157,7 +157,7 @@ class Iso17321(Standard):
         """
         return Estimate(value=self.fitted.smi, std=float(np.std([one.smi for one in self.drawn], ddof=1)), unit="1")
 
-    @Figure
+    @ClauseFigure
     def mean_difference(self) -> Estimate:
         """Return the mean colour difference.
 
@@ -166,7 +166,7 @@ class Iso17321(Standard):
         """
         return self._unbiased("mean_difference")
 
-    @Figure
+    @ClauseFigure
     def green_to_luminance(self) -> Estimate:
         """Return the coefficient from white-balanced green to luminance.
 

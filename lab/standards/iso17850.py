@@ -16,7 +16,7 @@ from lab.errors import NotDetermined
 from lab.formats.results import GeometryFit
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, PlotCurve, StandardMap, StandardPlot
-from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
+from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 from sim.scene.projection import CAMERA, Projection
 from sim.spectrum import FloatArray
 
@@ -94,7 +94,7 @@ class Iso17850(Standard):
         value, std = self._with_std(lambda intrinsics: float(self.local(corners, intrinsics).mean()))
         return Estimate(value=value, std=std, unit="%")
 
-    @Figure
+    @ClauseFigure
     def local_distortion_half(self) -> Estimate:
         """Return the local geometric distortion at half of the image height.
 
@@ -103,7 +103,7 @@ class Iso17850(Standard):
         """
         return self._at(0.5)
 
-    @Figure
+    @ClauseFigure
     def local_distortion_edge(self) -> Estimate:
         """Return the local geometric distortion at 0.9 of the image height.
 
@@ -112,7 +112,7 @@ class Iso17850(Standard):
         """
         return self._at(0.9)
 
-    @Figure
+    @ClauseFigure
     def largest_local_distortion(self) -> Estimate:
         """Return the largest local geometric distortion.
 
@@ -150,7 +150,7 @@ class Iso17850(Standard):
             found.append(outwards * bend / size[1 - axis])
         return 100.0 * float(np.mean(found))
 
-    @Figure
+    @ClauseFigure
     def horizontal_line_distortion(self) -> Estimate:
         """Return the line geometric distortion of horizontal lines.
 
@@ -161,7 +161,7 @@ class Iso17850(Standard):
         value, std = self._with_std(lambda intrinsics: self._bend(intrinsics, 0))
         return Estimate(value=value, std=std, unit="%")
 
-    @Figure
+    @ClauseFigure
     def vertical_line_distortion(self) -> Estimate:
         """Return the line geometric distortion of vertical lines.
 

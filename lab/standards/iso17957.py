@@ -12,7 +12,7 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, StandardMap
-from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
+from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
@@ -75,7 +75,7 @@ class Iso17957(Standard):
         at = np.unravel_index(int(np.argmax(sign * value)), value.shape)
         return Estimate(value=100.0 * float(value[at] - 1.0), std=100.0 * float(std[at]), unit="%")
 
-    @Figure
+    @ClauseFigure
     def luminance_shading(self) -> Estimate:
         """Return the luminance shading.
 
@@ -86,7 +86,7 @@ class Iso17957(Standard):
         at = np.unravel_index(int(np.argmin(value)), value.shape)
         return Estimate(value=100.0 * float(value[at] - 1.0), std=100.0 * float(std[at]), unit="%")
 
-    @Figure
+    @ClauseFigure
     def corner_shading(self) -> Estimate:
         """Return the mean luminance shading of the corners.
 
@@ -108,7 +108,7 @@ class Iso17957(Standard):
         low, high = self._extreme(channel, "G", -1.0), self._extreme(channel, "G", 1.0)
         return low if abs(low.value) > abs(high.value) else high
 
-    @Figure
+    @ClauseFigure
     def red_shading(self) -> Estimate:
         """Return the colour shading of red over green.
 
@@ -117,7 +117,7 @@ class Iso17957(Standard):
         """
         return self._colour("R")
 
-    @Figure
+    @ClauseFigure
     def blue_shading(self) -> Estimate:
         """Return the colour shading of blue over green.
 

@@ -20,7 +20,7 @@ from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation
 from lab.observables.observable import Observable
 from lab.observables.screens.dark_squares import measure_screen
-from lab.standards.standard import Figure, MeasuredSide, NotDone, Standard
+from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
@@ -53,7 +53,7 @@ class Iso18844(Standard):
         super().__init__(side, f"channel {channel}")
         self.share, self.covariance = share, covariance
 
-    @Figure
+    @ClauseFigure
     def flare(self) -> Estimate:
         """Return the image flare.
 

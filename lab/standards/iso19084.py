@@ -11,7 +11,7 @@ from lab.errors import NotDetermined
 from lab.formats.results import ChannelGeometry
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, PlotCurve, StandardPlot
-from lab.standards.standard import Figure, MeasuredSide, Standard
+from lab.standards.standard import ClauseFigure, MeasuredSide, Standard
 
 
 class Iso19084(Standard):
@@ -32,7 +32,7 @@ class Iso19084(Standard):
     def _largest(self) -> int:
         return int(np.argmax(np.abs(self.channel.radial_shift_px)))
 
-    @Figure
+    @ClauseFigure
     def largest_radial_displacement(self) -> Estimate:
         """Return the largest radial chromatic displacement.
 
@@ -42,7 +42,7 @@ class Iso19084(Standard):
         k = self._largest()
         return Estimate(value=self.channel.radial_shift_px[k], std=self.channel.radial_shift_px_std[k], unit="px")
 
-    @Figure
+    @ClauseFigure
     def relative_radial_displacement(self) -> Estimate:
         """Return the largest radial chromatic displacement over the image height.
 
@@ -53,7 +53,7 @@ class Iso19084(Standard):
         factor = 100.0 / self.half_diagonal_px
         return Estimate(value=factor * own.value, std=None if own.std is None else factor * own.std, unit="%")
 
-    @Figure
+    @ClauseFigure
     def centre_displacement(self) -> Estimate:
         """Return the chromatic displacement on the axis.
 

@@ -4,7 +4,7 @@ A file a standard. Its class holds the input of one subject (a plane, an edge, a
 that return an `Estimate` or raise `NotDetermined`, and its requirements yield what the recordings don't meet. The
 declaration of a figure stands in its docstring once, and page, table and documentation read it there:
 
-    @Figure
+    @ClauseFigure
     def system_gain(self) -> Estimate:
         '''Return the system gain.
 
@@ -49,7 +49,7 @@ class Declaration:
     formula: str
 
 
-class Figure(property):
+class ClauseFigure(property):
     """A property that is a figure of a standard. Raises ValueError for a docstring that doesn't declare it."""
 
     def __init__(self, compute: Callable[[Any], Estimate]) -> None:
@@ -122,7 +122,7 @@ class Standard:
             name: member.declaration
             for base in reversed(cls.__mro__)
             for name, member in vars(base).items()
-            if isinstance(member, Figure)
+            if isinstance(member, ClauseFigure)
         }
 
     def deviations(self) -> Iterator[Deviation]:

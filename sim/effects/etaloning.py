@@ -12,7 +12,7 @@ from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
-from sim.stages import Image, Pattern
+from sim.stages import GainPattern, Image
 
 #: Refractive index of silicon at 850 nm; 3.75 at 720 nm, 3.58 at 1000 nm.
 INDEX = 3.65
@@ -92,4 +92,4 @@ class Etaloning(Effect):
             turn = 4e3 * np.pi * INDEX * thickness_um / wavelength_nm
             return np.asarray(1.0 + 0.01 * self.strength_percent * left * np.cos(turn))
 
-        return image.add_laws(patterns=Pattern(thickness, factor))
+        return image.add_laws(patterns=GainPattern(thickness, factor))

@@ -12,7 +12,7 @@ from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
-from sim.stages import Image, Pattern
+from sim.stages import GainPattern, Image
 
 #: Periods that are tried first, px.
 PERIODS_PX = 6.0, 9.0, 13.0, 20.0, 30.0
@@ -75,4 +75,4 @@ class TreeRings(Effect):
             rings = 0.01 * self.amplitude_percent * np.cos(2.0 * np.pi * distance_um / self.period_um)
             return np.asarray(1.0 + rings)
 
-        return image.add_laws(patterns=Pattern(distance, factor, is_grey=True))
+        return image.add_laws(patterns=GainPattern(distance, factor, is_grey=True))

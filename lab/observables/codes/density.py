@@ -141,7 +141,7 @@ def measure_code_density(dataset: Dataset) -> Observable:
     )  # fmt: skip
 
 
-class _Level(NamedTuple):
+class _LevelCounts(NamedTuple):
     """The pixels of one level in one plane: their first code, their number, and by code (3, codes) the probability and
     its covariances with the first two Hermite polynomials, z and (z^2 - 1) / sqrt 2, of the normalised departure z."""
 
@@ -158,7 +158,7 @@ class _Counts:
     count: FloatArray
     expected: FloatArray
     captures: list[str]
-    planes: list[list[_Level]]
+    planes: list[list[_LevelCounts]]
 
     def take(self, dataset: Dataset, capture: Any) -> None:
         """Add a capture's frame."""
@@ -173,7 +173,7 @@ class _Counts:
         self.captures.append(capture.id)
 
 
-def _levels(plane: Any, dataset: Dataset) -> Iterator[_Level]:
+def _levels(plane: Any, dataset: Dataset) -> Iterator[_LevelCounts]:
     """Yield a plane's pixels by level.
 
     A pixel's expected code is the local mean over `AROUND` x `AROUND` pixels, and as much beside it as its row is on
@@ -207,7 +207,7 @@ def _levels(plane: Any, dataset: Dataset) -> Iterator[_Level]:
         # Poisson numbers s in units of the gain K have the third central moment K^2 (K s)
         skewness = noise.gain**2 * own / sigma**3
         whole = ndtr(edges) - skewness / 6.0 * (np.square(edges) - 1.0) * density
-        yield _Level(low, int(n), np.diff(np.array([whole, -density, -edges * density / np.sqrt(2.0)])))
+        yield _LevelCounts(low, int(n), np.diff(np.array([whole, -density, -edges * density / np.sqrt(2.0)])))
 
 
 def counted(dataset: Dataset) -> dict[bool, _Counts]:
@@ -318,7 +318,7 @@ def _propagated(linear: FloatArray, codes: CodeHistogram, counts: _Counts) -> tu
     return covariance - table @ table.T, operator
 
 
-def _direction(levels: Sequence[_Level], row: int, codes: CodeHistogram) -> tuple[int, FloatArray]:
+def _direction(levels: Sequence[_LevelCounts], row: int, codes: CodeHistogram) -> tuple[int, FloatArray]:
     """Return the sum of one row of the levels' tables, by the pixels of each, over the root of their number: the index
     of its first code in `codes`, and the values."""
     end = codes.first + len(codes.count)

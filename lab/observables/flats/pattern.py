@@ -50,7 +50,7 @@ WINDOW_CORRELATION = {-2: 1.0 / 6.0, -1: -2.0 / 3.0, 0: 1.0, 1: -2.0 / 3.0, 2: 1
 
 
 @dataclass(frozen=True)
-class _Part:
+class _PlanePart:
     """Flats in one light, seen or held out. Powers are by band, over the mean signal's square."""
 
     light: Spectrum | None
@@ -120,7 +120,7 @@ def _roughness(frequency: FloatArray | float) -> FloatArray:
     return np.asarray(square / 2.0 - square**2 / 32.0)
 
 
-def _of_flats(dataset: Dataset) -> list[_Part]:
+def _of_flats(dataset: Dataset) -> list[_PlanePart]:
     levels, images = dataset.once(flats)
     found = []
     for held_out, (image, noise) in sorted(images.items()):
@@ -133,11 +133,11 @@ def _of_flats(dataset: Dataset) -> list[_Part]:
         light = _light_of(dataset, captures[0])
         name = "all flats"
         names = tuple(c.id for c in captures)
-        found.append(_Part(light, None, name, held_out, names, power, own, fixed, plane.shape, used))
+        found.append(_PlanePart(light, None, name, held_out, names, power, own, fixed, plane.shape, used))
     return found
 
 
-def _of_infrared(dataset: Dataset) -> list[_Part]:
+def _of_infrared(dataset: Dataset) -> list[_PlanePart]:
     """Return narrowband flats of the longest wavelengths over the mean image of all flats, in which the pixels' own
     sensitivities cancel."""
     _, images = dataset.once(flats)
@@ -162,7 +162,7 @@ def _of_infrared(dataset: Dataset) -> list[_Part]:
             light, names = dataset.spectrum(captures[0].radiance), tuple(c.id for c in captures)
             name = f"{captures[0].wavelength_nm:g} nm over all flats"
             beside = _light_of(dataset, first)
-            found.append(_Part(light, beside, name, held_out, names, power, own, 0.0, plane.shape, used))
+            found.append(_PlanePart(light, beside, name, held_out, names, power, own, 0.0, plane.shape, used))
     return found
 
 
@@ -264,7 +264,7 @@ def _log_bias(shape: tuple[int, int]) -> FloatArray:
     return np.asarray(log_mean_bias(modes[:-1]) - log_mean_bias(modes[-1:]))
 
 
-def _pattern_powers(dataset: Dataset, parts: Sequence[_Part], effects: Effects) -> list[tuple[FloatArray, float]]:
+def _pattern_powers(dataset: Dataset, parts: Sequence[_PlanePart], effects: Effects) -> list[tuple[FloatArray, float]]:
     """Power of the pattern that effects leave in the flats of each part's light, as of `_powers`."""
     camera = dataset.camera
     step, model = mosaic.step(camera.cfa), Uniform(camera, effects)
@@ -290,7 +290,7 @@ def _pattern_powers(dataset: Dataset, parts: Sequence[_Part], effects: Effects) 
     return found
 
 
-def _covariance(parts: Sequence[_Part]) -> FloatArray:
+def _covariance(parts: Sequence[_PlanePart]) -> FloatArray:
     """Covariance of ln(power / own) of all parts. A part's bands have the pixels' own power in common; seen and
     held-out flats have the same pattern, and noise of their own."""
     bands = len(BAND_EDGES) - 1

@@ -17,7 +17,7 @@ from lab.formats.results import FitResult, StandardReading, StandardsResult
 from lab.report.standards import file_name, sections, write_standards
 from lab.report.standards_pdf import has_matplotlib, write_standards_pdf
 from lab.standards.reading import STANDARDS, read_standards
-from lab.standards.standard import Figure, Standard
+from lab.standards.standard import ClauseFigure, Standard
 from tests.lab.standards.conftest import EDGE_SIGMA_PX, EFFICIENCY, FULL_E, GAIN, READ_E
 from tests.lab.standards.edges import gaussian_transfer
 from tests.peers import missing
@@ -54,7 +54,7 @@ def test_every_figure_is_declared_once() -> None:
 def test_docstring_without_a_declaration_is_refused() -> None:
     with pytest.raises(ValueError, match="its docstring declares no figure"):
 
-        @Figure
+        @ClauseFigure
         def gain(self: object) -> object:
             """Return the gain."""
 
