@@ -57,6 +57,7 @@ NOT_RUN = {
     "docs/proof-twin.md": "hours: make twin",
     "docs/proof-unlisted.md": "hours: make proof-unlisted; tests/evaluation/test_unlisted.py makes two cases",
     "docs/proof.md": "hours: make proof; tests/evaluation/test_sealed.py makes and scores a few",
+    "docs/reference/standards.md": "minutes; tests/lab/standards and tests/lab/cli",
     "docs/reference/command-line.md": "written by docs/write_tables.py from the command line itself",
     "docs/reference/instruments.md": "a bench; tests/lab/cli/test_devices.py and tests/mocks/test_command.py",
     "docs/tutorial.md": "minutes; tests/lab/test_pipeline.py",

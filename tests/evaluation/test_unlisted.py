@@ -434,7 +434,7 @@ def test_a_sealed_set_is_made_diagnosed_and_only_then_opened(tmp_path: Path, mon
     away = truths.rename(tmp_path / "away.json")
     said = {"case-0001": result(), "case-0002": result(told("signal", "row", 8), held=(300.0, 120.0, 100))}
 
-    def diagnosed(case: Path, policy: object) -> CaseRun:
+    def diagnosed(case: Path, policy: object, engine: str) -> CaseRun:
         assert case.parent == folder
         assert not truths.exists()  # the diagnosis can do without
         if case.name == "case-0002":  # the last

@@ -188,6 +188,8 @@ def _levels(plane: Any, dataset: Dataset) -> Iterator[_LevelCounts]:
     noise = dataset.noise
     signal = max(float(surface.mean()) - noise.black, 1.0)
     variance = float(np.mean(np.square(plane - surface), dtype=float))
+    # where no gain is known, that of shot noise alone
+    gain = noise.gain if noise.gain_is_known else variance / signal
     # pixels are binned by level, in steps narrow beside the noise; the variance of the levels within a bin is added
     step = max(STEP_OF_LEVELS * np.sqrt(variance), 1.0)
     above = surface.ravel().astype(float) - float(surface.min())
@@ -205,7 +207,7 @@ def _levels(plane: Any, dataset: Dataset) -> Iterator[_LevelCounts]:
         edges = (np.arange(low, int(middle + 6.0 * sigma) + 3) - 0.5 - middle) / sigma
         density = np.exp(-0.5 * np.square(edges)) / np.sqrt(2.0 * np.pi)
         # Poisson numbers s in units of the gain K have the third central moment K^2 (K s)
-        skewness = noise.gain**2 * own / sigma**3
+        skewness = gain**2 * own / sigma**3
         whole = ndtr(edges) - skewness / 6.0 * (np.square(edges) - 1.0) * density
         yield _LevelCounts(low, int(n), np.diff(np.array([whole, -density, -edges * density / np.sqrt(2.0)])))
 

@@ -40,7 +40,11 @@ def test_every_sequence_is_listed_with_what_it_declares() -> None:
         for one in told.parameters:
             quantity = read_quantities(kind)[one.name]
             assert (one.unit, one.lower, one.upper) == (quantity.unit, quantity.lower, quantity.upper)
-    assert {one.name for told in catalogue() for one in told.parameters if one.several} == {"exposures_s", "levels"}
+    assert {one.name for told in catalogue() for one in told.parameters if one.several} == {
+        "exposures_s",
+        "gains_db",
+        "levels",
+    }
     with pytest.raises(InputError, match="no sequence 'magic'; there are dark"):
         described("magic")
 

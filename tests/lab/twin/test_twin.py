@@ -266,8 +266,10 @@ def test_a_model_without_a_correction_has_no_wider_intervals(content: CameraFile
                                 factor=(1.0, 1.02, 0.98, 1.02, 0.98), strength=1.0)  # fmt: skip
     plain, corrected = std(content), std(replace(content, effects=(*content.effects, scatters)))
     assert np.all(corrected["noise"] > 2.0 * plain["noise"])
-    for kind in ("chart", "slanted_edge", "dark"):
-        np.testing.assert_allclose(corrected[kind], plain[kind], rtol=0.01)  # drawn frames differ
+    # factors of 0.98 and 1.02 of the variance are 1 % of a standard deviation; drawn frames differ by 1 % in that of an
+    # edge's transfer, three times that at most
+    for kind, tolerance in (("chart", 0.01), ("slanted_edge", 0.01 + 3 * 0.011), ("dark", 0.01)):
+        np.testing.assert_allclose(corrected[kind], plain[kind], rtol=tolerance)
 
 
 def test_stated_photons_need_the_fitted_recordings(of_photons: tuple[CameraFile, RecordingSet, RecordingSet]) -> None:

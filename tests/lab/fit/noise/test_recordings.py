@@ -326,6 +326,7 @@ def test_no_figure_at_saturation_from_a_twentieth_of_the_range() -> None:
         assert getattr(wrong, f"{figure}_std") is None
     # up to 0.95 x 3800 DN of 65435
     assert any(re.search(r"is 5\.\d % of saturation, 50 % are needed", remark) for remark in wrong.remarks)
-    assert (
-        abs(wrong.conversion_gain_dn_per_e / sensor.gain - 1.0) < 3.5 * wrong.conversion_gain_dn_per_e_std / sensor.gain
-    )
+    # without the bend of 1 % at full well: the slope of the response is 1 % lower at half of it, and the variance over
+    # the mean falls by as much
+    allowed = 0.01 + 3.0 * wrong.conversion_gain_dn_per_e_std / sensor.gain
+    assert abs(wrong.conversion_gain_dn_per_e / sensor.gain - 1.0) < allowed
