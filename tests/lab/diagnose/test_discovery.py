@@ -302,6 +302,7 @@ def test_a_mismatch_without_a_name_gets_a_law_along_its_coordinate(
     ]
 
 
+@pytest.mark.extra
 def test_a_mismatch_that_nothing_predicts_says_what_would_help() -> None:
     camera = ConcealedCamera(772302, (TreeRingsLaw(3.0),), cfa="MONO", rows=128, cols=192)
     found = diagnose(recordings_of(camera, LIT_AND_DARK), None)
@@ -397,6 +398,7 @@ def test_noise_that_grows_with_the_time_is_found() -> None:
     assert slope == pytest.approx(16.0 / 600.0, abs=max(std, 0.1 * 16.0 / 600.0))
 
 
+@pytest.mark.extra
 def test_unequal_columns_of_a_mosaic_tell_the_greens_difference_too() -> None:
     """Four amplifiers in turn, each within 0.1 % by flats of a shot noise below 0.05 % a class: the difference of even
     and odd columns shows in the two greens alone, and one law tells both.

@@ -76,6 +76,7 @@ def test_white_is_that_of_the_illuminant() -> None:
     assert (x, y) == pytest.approx(tuple(wanted), abs=3e-4)
 
 
+@pytest.mark.extra
 def test_intervals_hold() -> None:
     """The index over 100 draws of sensitivities with 1 % noise; draws of draws are as many as a reading takes."""
     rng, curves = np.random.default_rng(6), gaussian_curves()
