@@ -22,7 +22,7 @@ from lab.formats.results.standards import (
     StandardReading,
     StandardsResult,
 )
-from lab.formats.results.words import measured
+from lab.formats.results.words import measured, shown_unit
 from lab.report import page_environment, write_page
 from lab.report.charts import (
     AFTER,
@@ -40,7 +40,7 @@ from lab.report.charts import (
 from lab.report.emva import spatial_plots, temporal_plots
 
 #: Most subjects that stand beside each other in one table.
-MOST_COLUMNS = 6
+MOST_COLUMNS = 4
 #: Most readings of one standard whose plots are shown.
 MOST_PLOTTED = 4
 NOT_BY = "not by the standard"
@@ -57,12 +57,18 @@ class StandardsPicture:
 
 @dataclass(frozen=True)
 class StandardRow:
-    """One figure of a standard in a table: a text a subject; `marks`: whether each is by the standard."""
+    """One figure of a standard in a table: a text a subject, in the figure's unit; `marks`: whether each is by the
+    standard."""
 
     figure: StandardFigure
     values: tuple[str, ...]
     marks: tuple[bool, ...]
     reason: str
+
+    @property
+    def unit(self) -> str:
+        """The unit as it is shown; empty of a ratio."""
+        return shown_unit(self.figure.unit)
 
 
 @dataclass(frozen=True)
@@ -160,7 +166,7 @@ def map_figure(one: StandardMap) -> Figure:
 def _value(figure: StandardFigure) -> str:
     if figure.estimate is None:
         return "–"
-    return measured(figure.estimate.value, figure.estimate.std, figure.estimate.unit)
+    return measured(figure.estimate.value, figure.estimate.std)
 
 
 def _tables(readings: Sequence[StandardReading]) -> Iterator[FigureTable]:

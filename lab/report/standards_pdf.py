@@ -18,7 +18,6 @@ import numpy as np
 from lab.errors import InputError, cannot_write
 from lab.formats.raw_file import replacing
 from lab.formats.results.standards import StandardsResult
-from lab.formats.results.words import shown_unit
 from lab.report.charts import Figure, Trace
 from lab.report.standards import NOT_BY, StandardSection, StandardsPicture
 
@@ -269,13 +268,11 @@ def _section(sheet: _Sheet, section: StandardSection) -> None:
         )
         for row in table.rows:
             label = textwrap.shorten(row.figure.quantity, 58, placeholder="…")
-            unit = shown_unit(row.figure.unit)
-            bare = [text.removesuffix(f" {unit}") for text in row.values]
             marked = [
                 (place, text if mark or text == "–" else f"{text} *", fg if mark or text == "–" else off)
-                for place, text, mark in zip(places, bare, row.marks, strict=True)
+                for place, text, mark in zip(places, row.values, row.marks, strict=True)
             ]
-            start = [(LEFT, label, fg), (0.37, row.figure.clause, muted), (0.42, unit, muted)]
+            start = [(LEFT, label, fg), (0.37, row.figure.clause, muted), (0.42, row.unit, muted)]
             sheet.row([*start, *marked], SMALL_PT - 0.6)
         sheet.gap()
     for line in section.remarks:
