@@ -20,6 +20,7 @@ from lab.formats.raw_file import replacing
 from lab.formats.results.standards import StandardsResult
 from lab.report.charts import Figure, Trace
 from lab.report.standards import NOT_BY, StandardSection, StandardsPicture
+from sim.spectrum import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -99,12 +100,19 @@ def _draw_trace(ax: Axes, trace: Trace) -> None:
     mode, line, marker = trace.get("mode", "lines"), trace.get("line", {}), trace.get("marker", {})
     colour = _colour(line.get("color") or marker.get("color"))
     style = DASHES.get(line.get("dash", "solid"), "-") if "lines" in mode else "none"
-    bars = {key: trace.get(f"error_{key}", {}).get("array") for key in "xy"}
-    if any(bars.values()):
-        spans = {f"{key}err": np.array([v or 0.0 for v in own], float) for key, own in bars.items() if own}
-        ax.errorbar(x, y, **spans, fmt="none", ecolor=colour, elinewidth=0.6)
-    shown = {"marker": "o", "markersize": 3.4, "markeredgewidth": 0} if "markers" in mode else {}
-    ax.plot(x, y, linestyle=style, linewidth=0.9, color=colour, label=name or "_", **shown)
+    x_err, y_err = (_spans(trace.get(f"error_{key}", {}).get("array")) for key in "xy")
+    if x_err is not None or y_err is not None:
+        ax.errorbar(x, y, xerr=x_err, yerr=y_err, fmt="none", ecolor=colour, elinewidth=0.6)
+    points = "o" if "markers" in mode else "none"
+    ax.plot(
+        x, y, linestyle=style, linewidth=0.9, color=colour, label=name or "_", marker=points, markersize=3.4,
+        markeredgewidth=0,
+    )  # fmt: skip
+
+
+def _spans(errors: Sequence[float | None] | None) -> FloatArray | None:
+    """Return the lengths of error bars, 0 where there is none; None without any."""
+    return np.array([v or 0.0 for v in errors], float) if errors else None
 
 
 class _Sheet:
