@@ -238,7 +238,7 @@ pictures. The PDF needs the extra `pdf` (matplotlib).
 - **Clauses** of ISO 15739, 17850 and 19084 are those of the published tables of contents, of ISO 12233 those of a
   published excerpt of the edition of 2014, of EMVA 1288 those of release 3.1, which release 4.0 Linear follows. Those
   of the other standards, whose texts were not at hand, name the place by the standards' usual order: check them
-  against the text. It isn't quoted. Where no public text gives a formula, the one that is used is stated beside the
+  against the text. It isn't quoted. Where no public text gives a formula, the one that is used is stated with the
   figure, and it is to be compared with the standard before a figure is certified.
 - **Uncertainty** is that of the recordings' noise, and of what is stated below. Calibrations of instruments are apart
   (`photons_systematic_std_percent` of the fit). Sensitivities enter ISO 17321-1 with the standard deviation of each
@@ -247,7 +247,7 @@ pictures. The PDF needs the extra `pdf` (matplotlib).
 ## Biases of the standards' own estimators
 
 BIASES_HERE
-Each page states the bias of its own set: `sfr50_bias` beside every edge, and the difference of K from the slope at zero
+Each page states the bias of its own set: `sfr50_bias` for every edge, and the difference of K from the slope at zero
 signal of the measured photon-transfer curve.
 
 ## The figures

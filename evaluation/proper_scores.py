@@ -98,9 +98,9 @@ class Bin:
 def case_statements(case: str, truth: CaseTruth, run: CaseRun) -> CaseStatements:
     """Return what was said of a case, with what is true of it.
 
-    An effect or a family that the truth accepts beside what is concealed is neither true nor false, and left out; so is
-    unlisted physics where a fault of metadata or a weak law is concealed. Everything about a case that failed has
-    probability 0.
+    An effect or a family that the truth accepts in addition to what is concealed is neither true nor false, and left
+    out; so is unlisted physics where a fault of metadata or a weak law is concealed. Everything about a case that
+    failed has probability 0.
     """
     found = run.diagnosis
     told = _effects(found)
@@ -252,9 +252,8 @@ def _score_lines(engines: Mapping[str, Sequence[CaseStatements]]) -> Iterator[st
         used = {e: [c for c in cases if group in ("all", c.group)] for e, cases in engines.items()}
         cells = [f"{np.mean([c.log_score for c in used[e]]):.2f}" for e in engines]
         for other in others:
-            pairs = zip(used[other], used[first], strict=True)
+            pairs = list(zip(used[other], used[first], strict=True))
             log = mean_interval([one.log_score - two.log_score for one, two in pairs])
-            pairs = zip(used[other], used[first], strict=True)
             brier = mean_interval([one.brier_score - two.brier_score for one, two in pairs])
             cells += [f"{log.value:+.2f} ({log.low:+.2f}..{log.high:+.2f})"]
             cells += [f"{brier.value:+.3f} ({brier.low:+.3f}..{brier.high:+.3f})"]

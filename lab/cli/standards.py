@@ -21,7 +21,9 @@ commands = typer.Typer()
 
 ReportFolder = Annotated[
     Path | None,
-    typer.Option("--report", metavar="DIR", help="write DIR/standards.html and a page a standard beside it"),
+    typer.Option(
+        "--report", metavar="DIR", help="write an overview, DIR/standards.html, and one page for each standard"
+    ),
 ]
 PdfFile = Annotated[
     Path | None, typer.Option("--pdf", metavar="FILE", help="write all standards as one PDF (needs calibench[pdf])")

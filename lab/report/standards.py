@@ -265,7 +265,7 @@ def sections(
 def write_standards(
     folder: Path, result: StandardsResult, recordings: RecordingSet, found: Sequence[StandardSection]
 ) -> Path:
-    """Write `folder`/standards.html, the overview, and a page a standard beside it; return the overview's path.
+    """Write `folder`/standards.html, the overview, and one page for each standard; return the overview's path.
     `found`: what `sections` returns. Raises InputError where one can't be written."""
     environment = page_environment()
     shared: dict[str, Any] = {

@@ -10,14 +10,11 @@ import numpy as np
 from lab.errors import NotDetermined
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, PlotCurve, StandardPlot
-from lab.formats.results.words import measured
 from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 from lab.standards.tone_steps import ToneSteps, tone_steps
 
 LEAST_STEPS = 12
 LEAST_TRIALS = 10
-#: Largest nonuniformity of the light over the patch that is read.
-LARGEST_SPAN_PERCENT = 2.0
 #: Share of the largest signal above which a level counts as saturated.
 SATURATED = 0.98
 #: Two levels whose ratio the slope of the log-log curve is taken over, shares of saturation.
@@ -119,14 +116,7 @@ class Iso14524(Standard):
                 limit=f"{LEAST_TRIALS} at least",
                 remedy="capture more repeats",
             )
-        if steps.span_percent - 2.0 * steps.span_percent_std > LARGEST_SPAN_PERCENT:
-            yield Deviation(
-                clause="4.2",
-                quantity="nonuniformity of the light (highest less lowest over the mean)",
-                found=measured(steps.span_percent, steps.span_percent_std, "%"),
-                limit=f"{LARGEST_SPAN_PERCENT:g} % at most",
-                remedy="light the sensor evenly, or read a smaller part of the frame",
-            )
+        yield from steps.unevenness("4.2")
 
     def conditions(self) -> Iterator[str]:
         yield f"{self.steps.exposure.size} levels, {self.steps.frames} images of each at least, raw data"

@@ -5,12 +5,15 @@ Both ISO 14524 (OECF) and ISO 15739 (noise) read them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
+from lab.formats.results.standards import Deviation
+from lab.formats.results.words import measured
 from lab.observables.flats.stated_light import light_of
 from lab.observables.noise.levels import MeasuredLevel
 from lab.observables.noise.stack import PlaneStatistics
@@ -18,6 +21,8 @@ from lab.standards.standard import MeasuredSide
 from sim.spectrum import FloatArray
 
 LEAST_LEVELS = 4
+#: Largest nonuniformity of the light over the patch that is read.
+LARGEST_SPAN_PERCENT = 2.0
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,18 @@ class ToneSteps:
         parabola through a level and its neighbours."""
         weights = slope_weights(self.exposure)
         return weights @ self.signal, np.sqrt(weights**2 @ self.signal_std**2)
+
+    def unevenness(self, clause: str) -> Iterator[Deviation]:
+        """Yield the deviation of light that is uneven by more than `LARGEST_SPAN_PERCENT`, two standard deviations
+        allowed for."""
+        if self.span_percent - 2.0 * self.span_percent_std > LARGEST_SPAN_PERCENT:
+            yield Deviation(
+                clause=clause,
+                quantity="nonuniformity of the light (highest less lowest over the mean)",
+                found=measured(self.span_percent, self.span_percent_std, "%"),
+                limit=f"{LARGEST_SPAN_PERCENT:g} % at most",
+                remedy="light the sensor evenly, or read a smaller part of the frame",
+            )
 
 
 def slope_weights(x: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ from lab.diagnose.evidence.side_table import SideTable, posterior_means
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.places import Slice, describe, log_tail, slices_of
 from lab.diagnose.outcome.detectability import detectable, smallest_sizes, told_as
+from lab.diagnose.outcome.residual_curves import curves_of
 from lab.formats.results import (
     ExaminedPlace,
     HeldOut,
@@ -328,32 +329,7 @@ def residual_curves(reading: SideTable, fit: FittedSet, unlisted: frozenset[int]
     estimates |= _of_held_out_alone(model, model.value - after, jacobian)
     after = after + sum(estimates[name] * column for name, column in jacobian.items() if name.startswith("held out: "))
     before = model.stated_mean(estimates)
-    white_dn = float(model.camera.white_level_dn)
-    for block, at in zip(model.blocks, model.slices, strict=True):
-        std = np.sqrt(np.diag(block.covariance))
-        stated = np.clip(before[at], 0.0, white_dn) if block.measurement.is_level else before[at]
-        lines: dict[tuple[str, str], list[int]] = {}
-        for i, label in enumerate(block.labels):
-            condition = label.condition if block.measurement.conditions else ""
-            lines.setdefault((condition, label.channel), []).append(i)
-        for (condition, channel), members in lines.items():
-            order = sorted(members, key=lambda i: block.labels[i].x)
-            yield ResidualCurve(
-                side=reading.side,
-                measurement=block.measurement.name,
-                label=condition or block.measurement.name,
-                channel=channel,
-                axis=block.measurement.places
-                or f"{block.measurement.axis.replace('_', ' ')}, {block.measurement.unit}",
-                quantity=block.measurement.quantity,
-                names=tuple(block.labels[i].condition for i in order) if block.measurement.places else (),
-                x=tuple(block.labels[i].x for i in order),
-                measured=tuple(float(block.value[i]) for i in order),
-                measured_std=tuple(float(std[i]) for i in order),
-                before=tuple(float(stated[i]) for i in order),
-                after=tuple(float(after[at][i]) for i in order),
-                held_out=block.labels[order[0]].held_out,
-            )
+    yield from curves_of(model, reading.side, before, after, held_out_apart=False)
 
 
 def _of_held_out_alone(

@@ -14,6 +14,7 @@ from lab.diagnose.inference.locate import chi2_by_slice
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.search import ModelSet
 from lab.diagnose.outcome.detectability import detectable, smallest_sizes, told_as
+from lab.diagnose.outcome.residual_curves import curves_of
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import (
     EffectSet,
@@ -126,32 +127,7 @@ def residual_curves(side: Side, verdict: Verdict) -> Iterator[ResidualCurve]:
     model = verdict.model
     before = model.stated_mean(model.nuisance_estimates(verdict.effects, verdict.kernels))
     after = model.fitted_mean(verdict.effects, verdict.kernels)
-    white_dn = float(model.camera.white_level_dn)
-    for block, at in zip(model.blocks, model.slices, strict=True):
-        std = np.sqrt(np.diag(block.covariance))
-        stated = np.clip(before[at], 0.0, white_dn) if block.measurement.is_level else before[at]
-        groups: dict[tuple[str, str, bool], list[int]] = {}
-        for i, label in enumerate(block.labels):
-            condition = label.condition if block.measurement.conditions else ""
-            groups.setdefault((condition, label.channel, label.held_out), []).append(i)
-        for (condition, channel, is_held_out), members in groups.items():
-            order = sorted(members, key=lambda i: block.labels[i].x)
-            yield ResidualCurve(
-                side=side,
-                measurement=block.measurement.name,
-                label=condition or block.measurement.name,
-                channel=channel,
-                axis=block.measurement.places
-                or f"{block.measurement.axis.replace('_', ' ')}, {block.measurement.unit}",
-                quantity=block.measurement.quantity,
-                names=tuple(block.labels[i].condition for i in order) if block.measurement.places else (),
-                x=tuple(block.labels[i].x for i in order),
-                measured=tuple(float(block.value[i]) for i in order),
-                measured_std=tuple(float(std[i]) for i in order),
-                before=tuple(float(stated[i]) for i in order),
-                after=tuple(float(after[at][i]) for i in order),
-                held_out=is_held_out,
-            )
+    yield from curves_of(model, side, before, after, held_out_apart=True)
 
 
 # --- The smallest detectable size of each effect in these recordings, and the effect that is most like it -------------
