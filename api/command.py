@@ -14,8 +14,7 @@ import typer
 
 from api.keys import Permission, check_bind, create_key, is_loopback, stored_keys
 from lab.capture.data_folder import open_store, store_to_read
-from lab.cli.console import Terminated
-from lab.errors import InputError, NoRoom
+from lab.errors import InputError, NoRoom, Terminated
 
 if TYPE_CHECKING:
     from lab.capture.store import Store

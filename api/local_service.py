@@ -23,7 +23,7 @@ _ADDRESS = re.compile(r"operator's page: (http://\S+)/")
 @contextlib.contextmanager
 def service_process(data: Path) -> Iterator[str]:
     """`calibench serve` on a data folder, in a process of its own; its address."""
-    command = [sys.executable, "-m", "lab.cli", "serve", "--data", str(data), "--port", "0"]
+    command = [sys.executable, "-m", "calibench", "serve", "--data", str(data), "--port", "0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
     address: list[str] = []

@@ -35,7 +35,7 @@ from lab.capture.station import Station
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
 from lab.capture_kinds.lamp import LampLight
 from lab.engine import DEFAULT_ENGINE, Engine
-from lab.formats.importers import KINDS
+from lab.foreign_recordings import KINDS
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
 from lab.formats.results.diagnosis import DiagnosisVerdict
 from lab.jobs import RemovedKind

@@ -71,7 +71,7 @@ class Foreign:
 
     def read(self, folder: Path) -> RecordingSet:
         """Return the recordings below `folder`. Raises InputError."""
-        from lab.formats.importers import KINDS, read_foreign
+        from lab.foreign_recordings import KINDS, read_foreign
 
         of_a_file = self.format in KINDS and KINDS[self.format].of_a_file
         if of_a_file and not self.path:

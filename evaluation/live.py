@@ -20,8 +20,8 @@ from typing import Literal
 
 from evaluation.experiment import CaseResult, Experiment, PagePicture, ScoredExperiment
 from evaluation.plots import ABSTAINED, RIGHT, WRONG, Axis, Mark, Row, row_plot
+from lab.bench_process import mock_bench
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
-from lab.cli.bench_process import mock_bench
 from lab.diagnose.visibility import visibility
 from lab.effect_titles import effect_title
 from lab.errors import InputError
@@ -497,7 +497,7 @@ def session_of(options: Sequence[str], folder: Path) -> DiagnosisResult:
 
 def _command(*arguments: str, data: Path | None = None) -> None:
     environment = dict(os.environ) | ({} if data is None else {"CALIBENCH_DATA": str(data)})
-    command = [sys.executable, "-m", "lab.cli", *arguments]
+    command = [sys.executable, "-m", "calibench", *arguments]
     subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
 
 

@@ -71,7 +71,7 @@ def open_recordings(
     (240, 320)
     """
     from lab.capture.data_folder import existing_store
-    from lab.formats.importers import importers, read_foreign
+    from lab.foreign_recordings import importers, read_foreign
     from lab.formats.importers.single_picture import ImportOptions
     from lab.formats.recording_set import RecordingError, inspect
     from lab.pipeline import source_recordings
@@ -663,7 +663,7 @@ def mock_bench(*conceal: str) -> Iterator[Path]:
     ...     station.name
     'station.toml'
     """
-    from lab.cli.bench_process import mock_bench as started
+    from lab.bench_process import mock_bench as started
 
     with started(conceal, () if conceal else ("--healthy",)) as station:
         yield station

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
+from lab.bench_process import mock_bench
 from lab.capture.data_folder import open_store, store_to_read
-from lab.cli.bench_process import mock_bench
 from lab.cli.console import check_writable, err, make_folder, out, write_json
 from lab.cli.sources import EngineName, Json, StoreFolder, recordings_of, run_here
 from lab.cli.tables import print_fit, print_resolving, print_sequences

@@ -29,10 +29,6 @@ if TYPE_CHECKING:
 EXIT_INTERNAL, EXIT_INPUT, EXIT_CHECK, EXIT_INTERRUPTED = 1, 2, 4, 130
 
 
-class Terminated(KeyboardInterrupt):
-    """SIGTERM: ends a command as Ctrl-C does."""
-
-
 class PlainConsole(Console):
     """A console that escapes control characters of what it shows: stored names, files' texts and instruments' answers
     can't write on the terminal. Its own colours stay."""

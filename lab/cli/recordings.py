@@ -112,8 +112,8 @@ def import_(
 
     Example: calibench import --from raw-folder frames --out my-camera
     """
+    from lab.foreign_recordings import read_foreign
     from lab.formats import recording_set
-    from lab.formats.importers import read_foreign
     from lab.formats.importers.single_picture import ImportOptions, chart_corners, grid
 
     if transfer not in ("", "linear", "srgb"):
