@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium ci-extra peers third-party names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
+.PHONY: aravis chromium ci-extra docs peers third-party names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
 
 setup: $(STAMP)
 
@@ -55,6 +55,13 @@ peers: $(STAMP)
 third-party: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[third-party]'
 	rm -rf calibench.egg-info  # as above
+
+# The documentation as a site, with search and the reference of the Python interface: build/site/index.html. A link that leads nowhere fails.
+docs: $(STAMP)
+	$(BIN)/python -c 'import sphinx, myst_parser, furo' 2>/dev/null || \
+		$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[docs]'
+	rm -rf calibench.egg-info  # as above
+	$(BIN)/sphinx-build --quiet --fail-on-warning --jobs 2 -c docs . build/site $(ARGS)
 
 # The browser in which the tests drive the operator's page, from the distribution.
 chromium:
