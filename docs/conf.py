@@ -39,10 +39,12 @@ python_use_unqualified_type_names = True
 #: The sections of the site: title, and pages (a pattern takes what no earlier line names).
 CONTENTS = {
     "Learn": ["docs/tutorial"],
-    "Do": ["docs/how-to/calibrate-my-camera", "docs/how-to/*", "docs/write-a-driver"],
+    "Do": ["docs/how-to/calibrate-my-camera", "docs/how-to/*", "docs/write-a-driver", "docs/test-a-driver"],
     "Look up": ["docs/reference/python", "docs/reference/*"],
     "Understand": [
         "docs/explanation/chain-of-light",
+        "docs/explanation/accuracy",
+        "docs/explanation/accuracy/*",
         "docs/explanation/*",
         "docs/explanation/examples/*",
         "docs/explanation/decisions/README",
