@@ -75,7 +75,7 @@ def serve(
     ] = None,
     webhook_host: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="a host that may be told of sessions' ends (webhook); may be repeated"),
+        typer.Option(metavar="NAME", help="a host to which webhooks of sessions may be sent; may be repeated"),
     ] = None,
     create_first_key: Annotated[
         bool | None,

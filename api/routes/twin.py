@@ -179,7 +179,8 @@ def camera_model_budget(
     model_id: HexId,
     use: Annotated[str, Query(max_length=200, description="some of MTF50, patches, variance, dark mean, by commas")],
     station: Annotated[
-        str | None, Query(max_length=100, description="rank its sequences by error reduced for a minute of lab time")
+        str | None,
+        Query(max_length=100, description="rank its sequences by the reduction per minute of lab time"),
     ] = None,
 ) -> dict[Side, BudgetResult]:
     """What matters for a use of each camera at the model's present uncertainty, as `calibench twin budget` tells it."""

@@ -123,7 +123,7 @@ def run(
         typer.Option(
             "--recordings",
             metavar="SOURCE",
-            help="with --resolve and --station: settle what these leave in doubt, a recording set's folder or a stored "
+            help="with --resolve and --station: resolve the rivals of these, a recording set's folder or a stored "
             "session's id, by captures of the station that made them",
         ),
     ] = "",
@@ -169,7 +169,7 @@ def run(
             raise InputError(
                 "--recordings: were captured already; leave --quick, --name, --resume, --only, --set and --conceal out"
             )
-        request = _settling(recordings, station, limits, out_folder)
+        request = _request_to_resolve(recordings, station, limits, out_folder)
     else:
         session = CaptureRequest(
             session=resume,
@@ -223,9 +223,9 @@ def _report_session(store: Store, station: Path | None, conceal: list[str] | Non
     out.print(f"\nsession: {session}")
 
 
-def _settling(source: str, station_file: Path, limits: ResolveLimits, data: Path | None) -> PipelineRequest:
-    """Return the request that settles what recordings leave in doubt, on the station that made them. Raises InputError
-    where it is another one."""
+def _request_to_resolve(source: str, station_file: Path, limits: ResolveLimits, data: Path | None) -> PipelineRequest:
+    """Return the request that resolves the rivals of recordings on the station that made them. Raises InputError where
+    the station is another one."""
     from lab.capture.station import read_station
     from lab.resolve import station_of
 

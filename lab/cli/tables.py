@@ -54,7 +54,7 @@ def _values(value: float | tuple[float, ...] | None) -> str:
 
 
 def _duration(seconds: float, learned: bool) -> str:
-    """A time in words; one that no session of the station showed is called a guess."""
+    """Return a time in words; marked as estimated where no session of the station showed it."""
     words = (
         f"{seconds:.0f} s"
         if seconds < 90
@@ -62,7 +62,7 @@ def _duration(seconds: float, learned: bool) -> str:
         if seconds < 5400
         else f"{seconds / 3600:.1f} h"
     )
-    return f"about {words}" if learned else f"perhaps {words}"
+    return f"about {words}" if learned else f"about {words} (estimated)"
 
 
 def print_skipped(skipped: tuple[Skipped, ...]) -> None:

@@ -100,11 +100,11 @@ def score(
     json: Json = None,
     sha256: Annotated[
         str | None,
-        typer.Option("--sha256", metavar="HASH", help="the hash as it was told, in place of the file beside"),
+        typer.Option("--sha256", metavar="HASH", help="the hash, in place of that in the file SEALED.sha256"),
     ] = None,
     data: StoreFolder = None,
 ) -> None:
-    """Open a sealed prediction against the recordings: deviations, intervals, and names that don't survive.
+    """Open a sealed prediction against the recordings: deviations, intervals, and effects that it contradicts.
 
     Example: calibench twin score f8.json session-at-f8
     """
@@ -150,8 +150,8 @@ def budget(
     json: Json = None,
     data: StoreFolder = None,
 ) -> None:
-    """Which effects and parameters, at their present uncertainty, matter for a use, how much each adds to its variance,
-    and which sequence of a station would reduce its error most for a minute of lab time.
+    """List the contributions of effects and parameters to the variance of an application, and the sequences of a
+    station by the reduction of that variance per minute of lab time.
 
     Example: calibench twin budget camera.toml --use mtf
     """

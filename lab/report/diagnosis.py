@@ -284,7 +284,7 @@ def _visibility(items: Sequence[Visibility]) -> dict[str, dict[Side, _Detectable
         }
         units = {name: (unit, quantity) for (name, unit), quantity in told.items()}
         sizes = [_smallest_size(name, value, *units[name]) for name, value in item.smallest.items()]
-        text = ", ".join(sizes) or "not a matter of size"
+        text = ", ".join(sizes) or "detectable at any magnitude"
         table.setdefault(item.effect, {})[item.side] = _Detectable(text, item.nearest, item.cosine, item.told_apart)
     return table
 
