@@ -208,7 +208,7 @@ def test_a_rival_that_bends_is_refitted_before_it_is_ruled_out() -> None:
         "bent": Hypothesis("bent", "a", (Coordinate("size", 1.0, lower=0.0),), _prototype(3.0)),
     }
     toy = Toy(value, {"straight": straight, "bent": bent}, np.zeros((40, 0)))
-    search = Search(toy, hypotheses, SetPrior({name: "a" for name in hypotheses}))
+    search = Search(toy, hypotheses, SetPrior(dict.fromkeys(hypotheses, "a")))
     table = search.run()
     either = {name: sum(r.probability for r in table.rows if name in r.members) for name in hypotheses}
     # at size 1 both predict the same; the integrals over the size differ by its bend, a few per cent
