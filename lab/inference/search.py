@@ -63,8 +63,9 @@ HOPELESS = 50.0
 #: Gain of log evidence above which an estimate is made again about the largest refitted part of its set: of large
 #: changes the closed form is wrong by a share of the gain.
 HALFWAY = 5.0
-#: The most hypotheses that are tried beside the likeliest set where the best gains more than `HOPELESS`.
-SINGLES = 8
+#: Gain of log evidence from which on the closed form about a set may be wrong by more than rivals differ: a change of
+#: the prediction isn't linear then. The most hypotheses that are refitted beside that set.
+CURVED, SINGLES = 10.0, 8
 #: Refits of sets that the closed form about a set far below the likeliest promises: about such a set it isn't linear.
 DOUBTFUL = 3
 #: P(any group is unlisted) of a camera.
@@ -291,15 +292,15 @@ class Search:
         return max(self._log_posterior(f) for f in self.fits.values())
 
     def _add_strong(self) -> None:
-        """While one more hypothesis promises so much that the closed form isn't linear, refit the likeliest set with
-        each of those that promise half of what the best does."""
+        """While one more hypothesis promises so much that the closed form isn't linear (`CURVED`), refit the likeliest
+        set with each of those that promise half of what the best does."""
         while True:
             origin = max(self.fits.values(), key=self._log_posterior)
             if origin.members not in self.singles:
                 self._linearise(origin)
             gains = self.singles[origin.members]
             top = max(gains.values(), default=0.0)
-            if top < HOPELESS:
+            if top < CURVED:
                 return
             strong = sorted((n for n, gain in gains.items() if gain > 0.5 * top), key=lambda n: -gains[n])[:SINGLES]
             keys = [origin.members | {name} for name in strong]
