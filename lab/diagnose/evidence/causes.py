@@ -70,26 +70,22 @@ def causes_of(reading: SideTable) -> tuple[Cause, ...]:
     """Return the effects that may be named, and the families of which no member is, likeliest first."""
     found = []
     posterior = reading.posterior
-    named_families = {library_family(f.name) for f in posterior.named if f.kind == "effect"}
+    named_families = {reading.family_of(f.name) for f in posterior.named if f.kind == "effect"}
     for finding in posterior.findings:
-        if finding.probability < LEAST_DESCRIBED:
+        if finding.probability < LEAST_DESCRIBED or finding.name in reading.statements:
             continue
         if finding.kind == "effect":
             members: tuple[tuple[str, float], ...] = ()
             law = finding.name
         elif finding.kind == "family" and finding.probability >= NAMED and finding.name not in named_families:
             members = members_of(reading, finding.name)
-            law = next((name for name, _ in members if weights_of_sets(reading.table, name)), "")
+            of_effects = (name for name, _ in members if name not in reading.statements)
+            law = next((name for name in of_effects if weights_of_sets(reading.table, name)), "")
         else:
             continue
         if law and weights_of_sets(reading.table, law):
             found.append(_cause(reading, finding.name, law, finding.probability, members))
     return tuple(found)
-
-
-def library_family(name: str) -> str:
-    """Return the family's identifier of an effect."""
-    return library()[name].family.value
 
 
 def members_of(reading: SideTable, family: str) -> tuple[tuple[str, float], ...]:
@@ -111,7 +107,7 @@ def _cause(
     effect = next(e for e in reading.effects_of(best.state) if e.name == law)
     draws = parameter_draws(table, law)
     names = {f.name for f in reading.posterior.findings if f.kind == "effect"}
-    alternatives = frozenset(n for n in names if library_family(n) == name) if members else frozenset((law,))
+    alternatives = frozenset(n for n in names if reading.family_of(n) == name) if members else frozenset((law,))
     prior = sum(reading.inclusion_prior[n] for n in alternatives)
     mean = draws.mean(axis=0)
     return Cause(
@@ -166,6 +162,8 @@ def _inexact(reading: SideTable, names: frozenset[str]) -> float:
 
 def _shared_groups(reading: SideTable, name: str) -> frozenset[int]:
     """Return the groups of small physics most of whose change lies in the measurements that an effect changes."""
+    if name in reading.statements:
+        return frozenset()
     kind = library()[name]
     model = reading.used
     touched = np.concatenate([np.full(len(b.value), b.touched_by(kind)) for b in model.blocks])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lab.capture_kinds.base import Equipment
-from lab.diagnose.evidence.causes import Cause, causes_of, library_family
+from lab.diagnose.evidence.causes import Cause, causes_of
 from lab.diagnose.evidence.doubt import doubt_of
 from lab.diagnose.evidence.improved import Improved, improve
 from lab.diagnose.evidence.places import (
@@ -26,7 +26,7 @@ from lab.diagnose.evidence.places import (
     unresolved,
 )
 from lab.diagnose.evidence.side_table import SideTable, predict_by_baseline
-from lab.diagnose.metadata import misstatements, unchecked
+from lab.diagnose.metadata import unchecked
 from lab.diagnose.metadata.stated_light import impossible_efficiency, misstated_light
 from lab.diagnose.outcome.next_capture import Doubt
 from lab.diagnose.outcome.residual_pictures import residual_pictures
@@ -45,10 +45,9 @@ from lab.formats.results import (
 )
 from lab.inference.check import check_held_out, passes
 from lab.inference.posterior import NAMED, Verdict, healthy_nothing, read_table, verdict
-from lab.inference.recordings import SideProblem, measure_side, search_side
+from lab.inference.restated import Searched, examine_side
 from lab.observables.flats.linearity import PHOTON_TRANSFER
 from sim.camera import Side
-from sim.memory import return_freed_memory
 
 #: Share of healthy cameras that are reported with a mismatch, and draws behind the threshold of p(nothing).
 FALSE_ALARM_RATE, DRAWS = 0.01, 100
@@ -123,26 +122,20 @@ def diagnose_side_by_evidence(
         fits.append(refit(used))
         return fits[-1]
 
-    problem = measure_side(recordings, side, None if refit is None else fitted, baseline)
-    misstated = misstatements(recordings, side)[1] if problem is None else problem.misstated
-    corrected = misstated[-1].corrected if misstated else recordings
-    metadata = tuple(one.told(side) for one in misstated)
-    remarks = tuple(unchecked(corrected, side))
-    if problem is None:
+    examined = examine_side(recordings, side, None if refit is None else fitted, baseline, report)
+    measured, searched = examined.recordings, examined.searched
+    metadata = tuple(one.told(side) for one in examined.wrong)
+    remarks = tuple(unchecked(measured, side))
+    if searched is None:
         return EvidenceFindings(side, DiagnosisLists(skipped=remarks, unexplained=metadata), metadata=metadata)
-    problem.groups  # noqa: B018  (they need what is shared between frames)
-    for one in (recordings, corrected, problem.dataset.recordings):
-        one.let_go()
-    return_freed_memory()
     fit = fits[-1] if fits else None
-    report("searching the sets of effects")
-    reading = _read(corrected, side, problem)
     report("reading the table")
+    reading = _read(measured, side, searched)
     return _findings(reading, fit, baseline, metadata, remarks, pictures=pictures, station=station)
 
 
-def _read(recordings: RecordingSet, side: Side, problem: SideProblem) -> SideTable:
-    search, table = search_side(problem)
+def _read(recordings: RecordingSet, side: Side, searched: Searched) -> SideTable:
+    problem, search, table = searched.problem, searched.search, searched.table
     return SideTable(
         recordings=recordings,
         side=side,
@@ -260,6 +253,6 @@ def _inclusion(reading: SideTable) -> dict[str, tuple[float, float]]:
     prior = reading.inclusion_prior
     families: dict[str, float] = {}
     for name, p in prior.items():
-        families[library_family(name)] = families.get(library_family(name), 0.0) + p
+        families[reading.family_of(name)] = families.get(reading.family_of(name), 0.0) + p
     found = {f.name: f.probability for f in reading.posterior.findings if f.kind in ("effect", "family")}
     return {name: (p, found.get(name, 0.0)) for name, p in {**families, **prior}.items()}
