@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lab.diagnose.evidence.side_table import SideTable
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.outcome.next_capture import NOTHING, WITH
+from lab.inference.hypotheses import Coordinate
 from lab.inference.posterior import NAMED, Size, parameter_draws, parameter_slice, sizes_of, weights_of_sets
 from lab.inference.search import FittedSet, Table
 from sim.effects.base import Effect
@@ -34,7 +35,8 @@ class Cause:
     """An effect, or a family of which no member is named, with its inclusion probability on one side.
 
     `effect`: the law whose parameters these are, at the mode of its likeliest set. `prior`: inclusion probability
-    before the recordings. `mean` (p,), `covariance` (p, p): of its parameters u, over the mixture. `members`: of a
+    before the recordings. `mean` (p,), `covariance` (p, p): of its parameters u, over the mixture; `coordinates`: these
+    with their priors. `members`: of a
     family, with their inclusion probabilities, likeliest first. `rivals`: what stands in its place in the sets without
     it, with their probabilities. `inexact`: probability that its law's error is above the declared tolerance, or that
     unlisted physics acts where it does, given the name. `alike`: the effect by other choices that remain probable."""
@@ -53,7 +55,7 @@ class Cause:
     modes: tuple[dict[str, float], ...] = ()
     alike: tuple[Effect, ...] = ()
     shown_in: tuple[str, ...] = ()
-    log_prior_density: float = field(default=0.0)
+    coordinates: tuple[Coordinate, ...] = ()
 
     @property
     def kind(self) -> type[Effect]:
@@ -132,9 +134,8 @@ def _cause(
         modes=tuple(_modes(reading, law, best, draws)),
         alike=tuple(_other_choices(reading, weights, effect)),
         shown_in=shown_in(reading.used, effect, reading.effects_of(best.state)),
-        log_prior_density=float(
-            sum(c.log_prior(u) for c, u in zip(hypothesis.coordinates, mean, strict=True) if not c.is_shape)
-        ),
+        # without their conversions, which can't be sent between processes
+        coordinates=tuple(replace(c, to_value=None) for c in hypothesis.coordinates),
     )
 
 
