@@ -214,6 +214,7 @@ def _entry(one: _Named, found: Sequence[EvidenceFindings]) -> NamedEffect:
     rivals = [(name, p * min(rest, 1.0)) for name, p in first.rivals]
     is_exact = all(cause.inexact <= LIKELIER for cause in one.causes)
     members = tuple(Member(name=n, probability=p) for n, p in first.members)
+    modes = first.modes if len(alike) == 1 else ()
     return NamedEffect(
         name=first.name,
         family=kind.family.value,
@@ -224,10 +225,10 @@ def _entry(one: _Named, found: Sequence[EvidenceFindings]) -> NamedEffect:
         parameters=parameters,
         combinations=combined,
         choices=choices,
-        modes=first.modes if len(alike) == 1 else (),
+        modes=modes,
         shown_in=shown_in,
         rivals=tuple(Rival(name=n, probability=p) for n, p in rivals if p >= LEAST_LISTED),
-        statement=_statement(one, first, parameters, combined, choices, shown_in, members, is_exact),
+        statement=_statement(one, first, parameters, combined, choices, shown_in, members, modes, is_exact),
         reference=kind.reference,
     )
 
@@ -240,6 +241,7 @@ def _statement(
     choices: dict[str, str],
     shown_in: Sequence[str],
     members: Sequence[Member],
+    modes: Sequence[Mapping[str, float]],
     is_exact: bool,
 ) -> str:
     """Return a named cause as a sentence: what physics was left out, how that shows, and its size."""
@@ -249,6 +251,9 @@ def _statement(
     values = ", ".join(sizes)
     if any(not p.sign_known for p in parameters.values()):
         values += "; sign unknown"
+    for mode in modes:
+        told = ", ".join(f"{plain_name(f, parameters[f].unit)} {v:.3g}" for f, v in mode.items() if f in parameters)
+        values += f"; {told} fits as well" if told else ""
     shown = sorted({measurement_title(name) for name in shown_in})
     seen = f"Seen in {' and '.join(shown)} of the {' and '.join(one.sides)} camera"
     if members:

@@ -28,9 +28,11 @@ from lab.diagnose.evidence.places import (
 from lab.diagnose.evidence.side_table import SideTable, predict_by_baseline
 from lab.diagnose.metadata import unchecked
 from lab.diagnose.metadata.stated_light import impossible_efficiency, misstated_light
+from lab.diagnose.outcome.mismatches import board_departure
 from lab.diagnose.outcome.next_capture import Doubt
 from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.outcome.settling_capture import settling_sentence
+from lab.diagnose.policy import DEFAULT_POLICY
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
@@ -39,6 +41,7 @@ from lab.formats.results import (
     FitResult,
     HeldOut,
     IncludedEffect,
+    Mismatch,
     SideModels,
     Skipped,
     Unexplained,
@@ -175,6 +178,11 @@ def _findings(
         left += unresolved(reading, before, mismatches)
     fitted = fit.cameras.get(side) if fit is not None else None
     has_levels = any(b.measurement is PHOTON_TRANSFER for b in reading.used.blocks)
+    shape = (reading.used.camera.rows, reading.used.camera.cols)
+    departure = board_departure(side, fitted.geometry if fitted is not None else None, shape, DEFAULT_POLICY)
+    if departure is not None:
+        left.append(departure)
+        mismatches.append(Mismatch(**departure.model_dump(include=set(Mismatch.model_fields))))
     stated = (
         *metadata,
         *misstated_light(side, fitted, levels_are_judged=has_levels),

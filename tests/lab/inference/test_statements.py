@@ -226,6 +226,33 @@ def test_a_wrong_exposure_of_darks_is_found(right: RecordingSet, factor: float) 
     assert set(found.captures) == {c.id for c in right.captures("dark") if c.exposure_s == 2.0}
 
 
+class _WrongShutter(ConcealedCamera):
+    """Frames `wrong` are exposed a tenth longer than is noted."""
+
+    wrong: range = range(0)
+
+    def expose(self, images: Any, exposure_s: float, k: int, temperature_c: float = 25.0) -> Any:
+        """Return the frame of capture k."""
+        return super().expose(images, exposure_s * (1.1 if k in self.wrong else 1.0), k, temperature_c)
+
+
+#: Numbers of captures after nine darks: a level of three repeats, and the second of a level's two passes.
+@pytest.mark.parametrize(("wrong", "shuttle"), [(range(18, 21), False), (range(31, 33), True)], ids=["level", "pass"])
+def test_a_wrong_shutter_of_flats_is_found(wrong: range, shuttle: bool) -> None:
+    """1.1 within three standard deviations of what is told; what is measured with it names nothing."""
+    camera = _WrongShutter(3, cfa="MONO", rows=96, cols=128)
+    camera.wrong = wrong
+    recordings = recordings_of(camera, Plan(("dark", "flat"), shuttle=shuttle))
+    examined = examine_side(recordings, "left", None)
+    (found,) = examined.wrong
+    assert found.captures == tuple(f"c{k:04d}" for k in wrong)
+    stated_s = next(c.exposure_s for c in recordings.captures() if c.id == found.captures[0])
+    fits_s, std_s = found.check.split("have the level of ")[1].split(" s")[0].split(" ± ")
+    assert abs(float(fits_s) - 1.1 * stated_s) < 3.0 * float(std_s)
+    assert examined.searched is not None
+    assert not read_table(examined.searched.table, examined.searched.search.hypotheses).named
+
+
 def test_a_wrong_black_level_is_found(right: RecordingSet) -> None:
     """Half of the true 168 DN, as another setting has it: thirteen standard deviations of 3 % and 2 DN."""
     true_dn = right.camera("left").black_level_dn
