@@ -13,7 +13,7 @@ nothing of u has the prior as its posterior, and c = 1."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special
@@ -51,6 +51,7 @@ from lab.inference.posterior import LIKELIER, NAMED, Size
 from lab.inference.search import REFITS
 from lab.observables.observable import measurement_title
 from sim.camera import Side
+from sim.effects.library import effects as library
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
@@ -73,6 +74,7 @@ class _Named:
 
 def merged_evidence(source: str, found: Sequence[EvidenceFindings], warnings: Sequence[str] = ()) -> DiagnosisResult:
     """Return the findings of all sides as one result. `warnings`: of the fit."""
+    found = told_by_all(found)
     lists = DiagnosisLists.joined([f.lists for f in found])
     named = _named(found)
     effects = tuple(_entry(one, found) for one in named)
@@ -121,21 +123,82 @@ RULES = (
 # --- names ------------------------------------------------------------------------------------------------------------
 
 
-def _named(found: Sequence[EvidenceFindings]) -> list[_Named]:
-    """Return what is named: of a camera for each side, of what both sides share once, likeliest first."""
+def told_by_all(found: Sequence[EvidenceFindings]) -> list[EvidenceFindings]:
+    """Return the findings of each side with the probabilities of what is its own given all sides."""
+    shared = {name: p for name, (p, _) in _shared(found).items()}
+    return [_reweighed(one, shared) for one in found]
+
+
+def _shared(found: Sequence[EvidenceFindings]) -> dict[str, tuple[float, list[tuple[EvidenceFindings, Cause]]]]:
+    """Return the causes that all sides share, with their probabilities given all, and what each side says of them."""
+    if len(found) < 2:
+        return {}
     by_name: dict[str, list[tuple[EvidenceFindings, Cause]]] = {}
     for findings in found:
         for cause in findings.causes:
             by_name.setdefault(cause.name, []).append((findings, cause))
-    named = []
-    for name, members in by_name.items():
-        if members[0][1].is_of_the_set and len(found) > 1:
-            probability = joint_probability(name, found, [cause for _, cause in members])
-            if probability >= NAMED:
-                sides = tuple(f.side for f, _ in members)
-                named.append(_Named(sides, tuple(cause for _, cause in members), probability))
-            continue
-        named += [_Named((f.side,), (c,), c.probability) for f, c in members if c.probability >= NAMED]
+    return {
+        name: (joint_probability(name, found, [cause for _, cause in members]), members)
+        for name, members in by_name.items()
+        if members[0][1].is_of_the_set
+    }
+
+
+def _reweighed(findings: EvidenceFindings, shared: Mapping[str, float]) -> EvidenceFindings:
+    """Return a side's findings with the probabilities of its own causes, of nothing and of unlisted states given what
+    all sides say of the shared hypotheses."""
+    weight = np.array([row.probability for row in findings.rows])
+    changed = weight.copy()
+    for name, p in shared.items():
+        holds = np.array([_holds(name, row.members) for row in findings.rows], bool)
+        own = float(weight[holds].sum() / weight.sum()) if len(weight) else 0.0
+        if 0.0 < own < 1.0:
+            changed = changed * np.where(holds, p / own, (1.0 - p) / (1.0 - own))
+    if not shared or not changed.sum() > 0.0:
+        return findings
+    before, after = weight / weight.sum(), changed / changed.sum()
+
+    def moved(probability: float, holds: np.ndarray) -> float:
+        """Return a probability as it changes by the listed sets, which hold nearly all."""
+        return float(np.clip(probability + after[holds].sum() - before[holds].sum(), 0.0, 1.0))
+
+    causes = tuple(
+        cause
+        if cause.is_of_the_set
+        else replace(
+            cause,
+            probability=moved(
+                cause.probability, np.array([_holds(cause.name, row.members) for row in findings.rows], bool)
+            ),
+        )
+        for cause in findings.causes
+    )
+    empty = np.array([not row.members and not row.unlisted for row in findings.rows], bool)
+    states = frozenset().union(*(row.unlisted for row in findings.rows))
+    likely = [after[np.array([state in row.unlisted for row in findings.rows])].sum() for state in states]
+    return replace(
+        findings, causes=causes, nothing=moved(findings.nothing, empty), calm=not any(p >= LIKELIER for p in likely)
+    )
+
+
+def _holds(name: str, members: frozenset[str]) -> bool:
+    """Whether a set holds an effect, or any member of a family."""
+    known = library()
+    return name in members or any(one in known and known[one].family.value == name for one in members)
+
+
+def _named(found: Sequence[EvidenceFindings]) -> list[_Named]:
+    """Return what is named: of a camera for each side, of what both sides share once, likeliest first."""
+    shared = _shared(found)
+    named = [
+        _Named(tuple(f.side for f, _ in members), tuple(cause for _, cause in members), p)
+        for p, members in shared.values()
+        if p >= NAMED
+    ]
+    for findings in found:
+        own = [c for c in findings.causes if c.probability >= NAMED and c.name not in shared]
+        effects = {library()[c.name].family.value for c in own if not c.members}
+        named += [_Named((findings.side,), (c,), c.probability) for c in own if not c.members or c.name not in effects]
     return sorted(named, key=lambda one: -one.probability)
 
 

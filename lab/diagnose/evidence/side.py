@@ -56,6 +56,8 @@ from sim.camera import Side
 FALSE_ALARM_RATE, DRAWS = 0.01, 100
 #: Probability that the listed sets hold together, and the most of them.
 SHARE, MOST_SETS = 0.95, 40
+#: Sets of less probability are left out of what sides tell each other.
+LEAST_ROW = 1e-6
 #: Seed of the draws: the same recordings give the same diagnosis.
 SEED = 1288
 
@@ -63,6 +65,15 @@ SEED = 1288
 Report = Callable[[str], None]
 #: Fits the captures that aren't held out.
 Refit = Callable[[RecordingSet], FitResult]
+
+
+@dataclass(frozen=True)
+class SetRow:
+    """A set of hypotheses, the states that have unlisted physics beside it, and its probability by one side."""
+
+    members: frozenset[str]
+    unlisted: frozenset[str]
+    probability: float
 
 
 @dataclass(frozen=True)
@@ -80,6 +91,7 @@ class EvidenceFindings:
     is_undecided : whether more than 1 % of the probability belongs to sets that had to be refitted and never were
     causes : effects and families that are probable enough to be described, likeliest first
     inclusion : prior and posterior inclusion probability of every effect and family, by name
+    rows : the sets of the table with their probabilities: members, states with unlisted physics
     metadata : statements that the recordings contradict
     improved : the improved model
     doubt : the sets that remain, and the captures that would separate them
@@ -98,6 +110,7 @@ class EvidenceFindings:
     is_undecided: bool = False
     causes: tuple[Cause, ...] = ()
     inclusion: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    rows: tuple[SetRow, ...] = ()
     metadata: tuple[Unexplained, ...] = ()
     held_out: HeldOut | None = None
     improved: CameraFile | None = None
@@ -214,6 +227,11 @@ def _findings(
         is_undecided=posterior.is_undecided,
         causes=causes,
         inclusion=_inclusion(reading),
+        rows=tuple(
+            SetRow(row.members, frozenset(reading.table.groups[g] for g in row.unlisted), row.probability)
+            for row in reading.table.rows
+            if row.probability > LEAST_ROW
+        ),
         metadata=stated,
         held_out=held_out_of(reading),
         improved=improved.camera,

@@ -10,8 +10,8 @@ import pytest
 from scipy.special import expit, logit
 
 from lab.diagnose.evidence.causes import Cause
-from lab.diagnose.evidence.merge import joint_moments, joint_probability, merged_evidence
-from lab.diagnose.evidence.side import EvidenceFindings
+from lab.diagnose.evidence.merge import joint_moments, joint_probability, merged_evidence, told_by_all
+from lab.diagnose.evidence.side import EvidenceFindings, SetRow
 from lab.diagnose.evidence.side_table import SideTable
 from lab.diagnose.outcome.expected_information import Forecast, settling_probability
 from lab.diagnose.outcome.next_capture import NOTHING, next_sentence
@@ -103,6 +103,37 @@ def test_sides_that_contradict_each_other_name_no_common_cause() -> None:
     result = merged_evidence("made up", _pair(causes))
     assert not result.effects
     assert result.verdict == "unexplained"
+
+
+def test_a_rival_of_what_both_sides_share_falls_with_what_the_other_side_says() -> None:
+    """Left: the lamp's drift or a defocus, one of the two, equally probable. Right: the drift, nearly surely. Given
+    both, the drift has p, and the defocus, which is in all of left's other sets, 1 - p."""
+    drift, defocus = _drift(0.5), _cause(Defocus(defocus_um=3.0), 0.5, 3.0, 0.1, "defocus_um")
+    left = replace(
+        _side("left", drift), causes=(drift, defocus),
+        rows=(
+            SetRow(frozenset({"source_drift"}), frozenset(), 0.5),
+            SetRow(frozenset({"defocus"}), frozenset({"response"}), 0.5),
+        ),
+        calm=True,
+    )  # fmt: skip
+    sure = _drift(0.9999)
+    right = replace(
+        _side("right", sure), rows=(SetRow(frozenset({"source_drift"}), frozenset(), 1.0),)
+    )  # of one set: nothing to reweigh
+    p = joint_probability("source_drift", (left, right), [drift, sure])
+    assert p > 0.99
+    told, other = told_by_all((left, right))
+    assert {c.name: c.probability for c in told.causes} == pytest.approx({"source_drift": 0.5, "defocus": 1.0 - p})
+    assert told.calm
+    assert other == right
+    (named,) = merged_evidence("made up", (left, right)).effects
+    assert (named.name, named.sides, named.probability) == ("source_drift", ("left", "right"), pytest.approx(p))
+
+
+def test_one_side_tells_what_it_tells() -> None:
+    alone = replace(_side("left", _drift(0.97)), rows=(SetRow(frozenset({"source_drift"}), frozenset(), 1.0),))
+    assert told_by_all((alone,)) == [alone]
 
 
 def test_an_effect_of_a_camera_has_an_entry_for_each_side() -> None:
