@@ -115,10 +115,8 @@ def _likeliest(table: Table) -> list[Row]:
 def _predict(problem: SideProblem, search: Search, row: Row, table: Table) -> tuple[FloatArray, FloatArray]:
     """Residual (n*,) and covariance (n*, n*) of the held-out numbers given those that are used, under one set, its
     parameters, theta and delta marginalised about the mode."""
-    from lab.inference.recordings import SideModel
-
     fit = table.fits[row.members]
-    model = SideModel(problem.whole, problem.groups)
+    model = problem.whole_model(problem.groups)
     used = len(problem.measured.value)
     value = problem.whole.value
     gaussian = model.gaussian(fit.state, fit.likeliest.form)

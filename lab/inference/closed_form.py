@@ -39,7 +39,8 @@ _BEYOND = 4.5
 
 @dataclass(frozen=True)
 class Signature:
-    """An alternative's changes of the prediction (n, k), given no other hypothesis."""
+    """An alternative's changes of the prediction (n, k), given no other hypothesis. `is_whole`, `log_share`: as of the
+    alternative."""
 
     owner: str
     index: int  # of the alternative
@@ -47,6 +48,8 @@ class Signature:
     coordinates: tuple[Coordinate, ...]  # of the coefficients
     columns: tuple[int, ...]  # in the stacked table
     points: tuple[tuple[int, int | None], ...]  # of each column, the alternative's points of positive and negative sign
+    is_whole: bool = False
+    log_share: float = 0.0
 
     def of_points(self, c: FloatArray, count: int) -> FloatArray:
         """Return the coefficients (>= 0) of all points of the alternative, given those of the columns."""
@@ -76,7 +79,9 @@ def signatures_of(model: Model, hypotheses: Mapping[str, Hypothesis]) -> tuple[S
                 for plus, minus in points
             )
             columns = tuple(range(at, at + raw.shape[1]))
-            found.append(Signature(name, index, raw, coords, columns, points))
+            found.append(
+                Signature(name, index, raw, coords, columns, points, alternative.is_whole, alternative.log_share)
+            )
             at += raw.shape[1]
     return tuple(found)
 
@@ -115,16 +120,18 @@ def integrate_set(z: FloatArray, gram: FloatArray, members: Sequence[Signature])
     a, b = gram[np.ix_(own, own)], z[own]
     low = np.array([c.lower for c in coords])
     scale = np.array([c.scale for c in coords])
-    c = np.zeros(len(own))
+    whole = np.array([s.is_whole for s in members for _ in s.columns], bool)
+    c = whole.astype(float)
+    free = np.flatnonzero(~whole)
     for _ in range(40):
         before = c.copy()
-        for k in range(len(own)):
+        for k in free:
             weight = (DEGREES + 1.0) / (DEGREES + (c[k] / scale[k]) ** 2) / scale[k] ** 2
             c[k] = max((b[k] - a[k] @ c + a[k, k] * c[k]) / (a[k, k] + weight), low[k])
         if np.all(np.abs(c - before) < 1e-4 * scale):
             break
     slope = b - a @ c
-    found = integrate(a, slope, coords, c)
+    found = integrate(a[np.ix_(free, free)], slope[free], [coords[int(k)] for k in free], c[free])
     return float(b @ c - 0.5 * c @ a @ c) + found.log_integral, c
 
 
@@ -174,6 +181,9 @@ def signature_log_odds(z: FloatArray, gram: FloatArray, signatures: Sequence[Sig
     parts: list[tuple[int, float, float, float, bool]] = []
     for i, s in enumerate(signatures):
         own = list(s.columns)
+        if s.is_whole:
+            found[i] = z[own[0]] - 0.5 * gram[own[0], own[0]]
+            continue
         if len(own) > 1 and signal[own].max() > _WEAK:
             found[i] = integrate_set(z, gram, [s])[0]
             continue
@@ -280,6 +290,10 @@ class HealthyDraws:
         split = left.shape[1] - draws
         found = np.empty((len(signatures), draws))
         for i, s in enumerate(signatures):
+            if s.is_whole:
+                (k,) = s.columns
+                found[i] = left[k, split:] - 0.5 * left[k, k]
+                continue
             columns = zip(s.columns, s.coordinates, strict=True)
             each = np.array([log_odds_of_draws(left[k, split:], float(left[k, k]), c) for k, c in columns])
             best = each.max(axis=0)
@@ -295,7 +309,9 @@ def gains_of(
     own: dict[str, list[int]] = {}
     for i, s in enumerate(signatures):
         own.setdefault(s.owner, []).append(i)
-    return {name: log_mean_exp(ratio[own[name]]) for name in hypotheses if name in own}
+    share = np.array([s.log_share for s in signatures])
+    weighted = ratio + share.reshape(-1, *(1,) * (ratio.ndim - 1))
+    return {name: log_mean_exp(weighted[own[name]]) for name in hypotheses if name in own}
 
 
 def others_over_empty(gains: Mapping[str, FloatArray], prior: SetPrior) -> FloatArray:

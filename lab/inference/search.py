@@ -320,7 +320,11 @@ class Search:
         losses: list[tuple[float, str]] = []
         for name in best.state:
             own = [k for k, (owner, _, c) in enumerate(places) if owner == name and not c.is_shape]
-            if not own or best.members - {name} in self.fits:
+            if best.members - {name} in self.fits:
+                continue
+            if not self.hypotheses[name].coordinates:  # it acts as a whole: how far from 0 isn't known
+                losses.append((0.0, name))
+            if not own:
                 continue
             away = stacked(best.state)[own]
             covariance = best.laplace.covariance[np.ix_(own, own)] + 1e-12 * np.diag(np.square(away) + 1e-300)
@@ -640,7 +644,10 @@ class Search:
                 single[i] = integrate_set(z, gram, [s])
                 owners.setdefault(s.owner, []).append(i)
         ratio = self._averaged_over_scales(origin.likeliest.scales, unlisted, whole, single)
-        gains = {o: log_sum_exp([ratio[i] for i in own]) - float(np.log(len(own))) for o, own in owners.items()}
+        gains = {
+            o: log_sum_exp([ratio[i] + signatures[i].log_share for i in own]) - float(np.log(len(own)))
+            for o, own in owners.items()
+        }
         if not unlisted:
             for o, own in owners.items():
                 taken = {
@@ -862,8 +869,10 @@ def _differ(one: FittedSet, other: FittedSet) -> bool:
 
 
 def _choices(point: Point) -> object:
+    """Return what tells a point from others of its hypothesis beside u: an effect's choices; else the template."""
     template = point.template
-    return None if template is None else tuple(getattr(template, n) for n in type(template).choices())
+    names = getattr(type(template), "choices", None)
+    return template if names is None else tuple(getattr(template, n) for n in names())
 
 
 def _normal_prior(coords: Sequence[Coordinate], u: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -365,6 +365,8 @@ def detectability(reading: SideTable) -> Iterator[Visibility]:
     columns: dict[str, list[tuple[tuple[Effect, ...], FloatArray]]] = {}
     scale: dict[str, float] = {}
     for name, hypothesis in reading.search.hypotheses.items():
+        if name in reading.statements:  # a wrong statement has no size from which on it would show
+            continue
         for alternative in hypothesis.alternatives:
             effects = tuple(point.template for point in alternative.points)
             white = reading.baseline.whiten(np.column_stack([model.mean((e,)) - base for e in effects]))

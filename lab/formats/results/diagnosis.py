@@ -140,6 +140,7 @@ class Unexplained(Frozen):
     correction: str = ""  # the model discrepancy, or the discovered law, in words
     would_help: str = ""  # captures that would help where nothing predicts it, as a sentence
     check: str = ""  # stated values, of the camera or of captures, that the recordings contradict, as sentences
+    probability: float | None = None  # of a stated value: that it is wrong; None where that isn't weighed
 
     @property
     def corrects_curves(self) -> bool:
