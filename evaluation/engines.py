@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.draw import recordings_of
-from evaluation.independent_simulator import LISTED, OUTSIDE, ConcealedCamera, Law
+from evaluation.independent_simulator import LISTED, OUTSIDE, UNLISTED, ConcealedCamera, Law
 from evaluation.own_chain import healthy_session
 from lab.diagnose import diagnose
 from lab.errors import InputError
@@ -117,10 +117,10 @@ def recordings_named(name: str) -> RecordingSet:
 
 
 def _law(name: str) -> type[Law]:
-    for law in (*LISTED, *OUTSIDE):
+    for law in (*LISTED, *OUTSIDE, *UNLISTED):
         if law.name == name:
             return law
-    known = ", ".join(sorted(law.name for law in (*LISTED, *OUTSIDE)))
+    known = ", ".join(sorted(law.name for law in (*LISTED, *OUTSIDE, *UNLISTED)))
     raise InputError(f"law {name!r}: isn't known; choose one of {known}")
 
 

@@ -31,6 +31,7 @@ from lab.diagnose.outcome.goodness_of_fit import (
     side_models,
 )
 from lab.diagnose.outcome.improved_model import improved_model
+from lab.diagnose.outcome.corrections import with_laws
 from lab.diagnose.outcome.mismatches import (
     board_departure,
     corrected_by_laws,
@@ -42,7 +43,6 @@ from lab.diagnose.outcome.mismatches import (
     shown_in,
     unexplained,
     vetoed_names,
-    with_laws,
 )
 from lab.diagnose.outcome.names_in_doubt import names_in_doubt
 from lab.diagnose.outcome.next_capture import Doubt

@@ -65,6 +65,22 @@ class Model(Protocol):
 
 
 @dataclass(frozen=True)
+class Process:
+    """One Gaussian process of a group: its values f (k,) at its nodes, given the coefficients d (r,) of the group's
+    columns, d ~ N(0, tau^2):
+
+        f = values d + f',   f' ~ N(0, tau^2 rest)
+
+    f' is what the numbers don't show. `columns`: the process's part of the group's columns. `curve`: what the nodes
+    are; None in a toy."""
+
+    values: FloatArray  # (k, r)
+    rest: FloatArray  # (k, k)
+    columns: FloatArray  # (n, r)
+    curve: Any = None
+
+
+@dataclass(frozen=True)
 class Group:
     """One group of delta: its columns H (n, r) at tau = 1, and its everyday scale s_g, in the same unit.
 
@@ -78,6 +94,7 @@ class Group:
     source: str = ""
     largest: float = 1.0
     held_out: FloatArray | None = None  # the same columns at the held-out numbers, (n*, r)
+    processes: tuple[Process, ...] = ()
 
     def scales(self, unlisted: bool) -> FloatArray:
         """Return the points of tau at which it is integrated: medians of shares of the prior (`shares`)."""

@@ -167,7 +167,9 @@ def _in_time_order(recordings: RecordingSet, side: Side) -> list[Capture]:
 
 def _with_history(dataset: Dataset, order: list[Capture]) -> Dataset:
     """Return the dataset with all of the side's captures as its history: what frames before leave in a frame doesn't
-    ask whether they are held out. Their levels predict, and aren't data."""
+    ask whether they are held out, nor does the time since the first one. Their levels predict, and aren't data."""
+    times = [c.time for c in order if c.time is not None]
+    dataset.first_time = min(times, default=None)
     dataset.in_time_order = [c for c in order if c.id not in dataset.copies.ids]
     dataset.__dict__.pop("_before", None)
     return dataset

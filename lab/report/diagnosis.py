@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from lab.diagnose.discovery.words import departure_unit
 from lab.diagnose.outcome.detectability import detectable, told_as
+from lab.diagnose.outcome.law_words import departure_unit
 from lab.formats.results import (
     DiagnosisResult,
     DiscoveredLaw,

@@ -13,6 +13,7 @@ from lab.capture_kinds.base import Equipment
 from lab.diagnose.evidence.causes import Cause, causes_of, library_family
 from lab.diagnose.evidence.doubt import doubt_of
 from lab.diagnose.evidence.improved import Improved, improve
+from lab.diagnose.evidence.laws import laws_of
 from lab.diagnose.evidence.places import (
     contradicted,
     detectability,
@@ -171,7 +172,8 @@ def _findings(
     named = [cause for cause in causes if cause.probability >= NAMED]
     passed = passes(reading.checked)
     said = verdict(posterior, reading.least_nothing, passed)
-    improved = improve(reading, fit, baseline, named)
+    laws = laws_of(reading)
+    improved = improve(reading, fit, baseline, named, laws)
     after = reading.gaussian(improved.fit, improved.unlisted)
     before = examine_places(reading.used, reading.baseline)
     departs = said != "no_mismatch"
@@ -194,6 +196,7 @@ def _findings(
             mismatches=tuple(mismatches),
             unexplained=(*stated, *left),
             unlisted=tuple(unlisted),
+            discovered=tuple(law.told for law in laws),
             models=(_models(reading),),
             places=tuple(examined(reading, before, after)),
             measurements=tuple(measurement_fits(reading, after)),

@@ -348,14 +348,6 @@ def left_to_smooth(verdict: Verdict, words: dict[int, str]) -> list[Discrepancy]
     ]
 
 
-def with_laws(improved: CameraFile, laws: Sequence[EmpiricalLaw]) -> CameraFile:
-    """Return the improved model with discovered laws; what they add to the dark noise, its read noise loses."""
-    added_e2 = sum(float(np.mean(law.table)) for law in laws if law.stage == "signal" and law.of == "variance")
-    read_e = float(np.sqrt(max(improved.camera.read_noise_e**2 - added_e2, 0.0)))
-    camera = improved.camera.model_copy(update={"read_noise_e": read_e}) if added_e2 else improved.camera
-    return replace(improved, camera=camera, effects=(*improved.effects, *laws))
-
-
 def corrected_by_laws(
     verdict: Verdict, corrections: Sequence[Correction], words: dict[int, str]
 ) -> tuple[Correction, ...]:
