@@ -21,6 +21,7 @@ from lab.diagnose.inference.side_model import dataset_of, measurement_model
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.metadata.stated_light import impossible_efficiency, misstated_light
+from lab.diagnose.outcome.corrections import with_laws
 from lab.diagnose.outcome.determined import combinations
 from lab.diagnose.outcome.goodness_of_fit import (
     detectability,
@@ -31,7 +32,6 @@ from lab.diagnose.outcome.goodness_of_fit import (
     side_models,
 )
 from lab.diagnose.outcome.improved_model import improved_model
-from lab.diagnose.outcome.corrections import with_laws
 from lab.diagnose.outcome.mismatches import (
     board_departure,
     corrected_by_laws,

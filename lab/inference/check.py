@@ -115,7 +115,7 @@ def _likeliest(table: Table) -> list[Row]:
 @dataclass(frozen=True)
 class CurvePrediction:
     """What delta of one group, given the used numbers, takes off chi2 of n held-out numbers: chi2 of their residuals
-    with the group everyday, and with delta's mean besides; both by the covariance without it."""
+    without any delta of the group, and with its mean; both by the covariance without it."""
 
     n: int
     chi2_before: float
@@ -132,17 +132,17 @@ def predict_by_curve(
     where = np.isin(names, list(measurements))
     if row is None or not where.any():
         return None
-    without, covariance = _predict(problem, search, row, table, row.unlisted - {group})
-    beside, _ = _predict(problem, search, row, table, row.unlisted)
+    without, covariance = _predict(problem, search, row, table, without=group)
+    beside, _ = _predict(problem, search, row, table)
     own = covariance[np.ix_(where, where)]
     return CurvePrediction(int(where.sum()), chi2(without[where], own), chi2(beside[where], own))
 
 
 def _predict(
-    problem: SideProblem, search: Search, row: Row, table: Table, unlisted: frozenset[int] | None = None
+    problem: SideProblem, search: Search, row: Row, table: Table, without: int | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Residual (n*,) and covariance (n*, n*) of the held-out numbers given those that are used, under one set, its
-    parameters, theta and delta marginalised about the mode. `unlisted`: in the place of the row's groups."""
+    parameters, theta and delta marginalised about the mode. `without`: a group of which there is none."""
     from lab.inference.recordings import SideModel
 
     fit = table.fits[row.members]
@@ -150,7 +150,9 @@ def _predict(
     used = len(problem.measured.value)
     value = problem.whole.value
     gaussian = model.gaussian(fit.state, fit.likeliest.form)
-    tau = fit.likeliest.scales.mode(row.unlisted if unlisted is None else unlisted)
+    tau = fit.likeliest.scales.mode(row.unlisted).copy()
+    if without is not None:
+        tau[without] = 0.0
     disturbances = np.vstack(
         [
             scaled_columns(problem.groups, tau, used),

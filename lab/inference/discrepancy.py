@@ -69,7 +69,8 @@ TRANSFER, FIELD, SPECTRAL, LINES, RESPONSE, SOURCE, OFFSET, SHOT, ROWS, BORDERS 
         "healthy sets of a simulator with transfer functions in closed form: 0.1 % at most; twice that for real lenses",
     ),
     GroupDeclaration(
-        "field", 0.0005, "1, of the irradiance by place, and of the shortest exposure", "healthy sets: 0.03 % at most beside the free tilt and bow",
+        "field", 0.0005, "1, of the irradiance by place, and of the shortest exposure",
+        "healthy sets: 0.03 % at most beside the free tilt and bow",
     ),
     GroupDeclaration(
         "spectral", 0.002, "1, of the transmittance by wavelength",
@@ -215,9 +216,9 @@ _LEAST_FACTOR = 0.02
 
 @dataclass(frozen=True)
 class StateCurve:
-    """A process along one axis of a state: its nodes `at`, and `unit`, by which the state changes there where its value
-    is 1. A table that repeats after `period` indices has no nodes. Values of the first `fixed` nodes are none. `curves`:
-    of so many channels, one after the other."""
+    """A process along one axis of a state: its nodes `at`, and `unit`, by which the state changes where its value is 1.
+    A table that repeats after `period` indices has no nodes. Values of the first `fixed` nodes are none. `curves`: of
+    so many channels, one after the other."""
 
     stage: Stage
     along: Along | Directed
@@ -276,7 +277,7 @@ class StateCurve:
         table = np.maximum(1.0 + change, _LEAST_FACTOR) if self.none == 1.0 else change
         if self.of != "mean" and self.none == 0.0:
             table = table - min(float(table.min()), 0.0)
-        if self.stage == "codes":
+        if self.period and self.none == 1.0:
             table = table / table.mean()
         return EmpiricalLaw(
             stage=self.stage, along=self.along, of=self.of, period=self.period, at=self.at,  # type: ignore[arg-type]
@@ -311,7 +312,7 @@ def _on_state(model: MeasurementModel, base: FloatArray, curves: Iterator[StateC
         own = [(model.mean((curve.law(_STEP * one),)) - base) / _STEP for one in np.eye(curve.nodes)]
         table = np.column_stack(own)
         if table.any():
-            factor = np.linalg.cholesky(curve.kernel)
+            factor = np.asarray(np.linalg.cholesky(curve.kernel), float)
             yield _Columns(table @ factor, factor, curve)
 
 

@@ -21,6 +21,7 @@ from lab.inference.model import Process
 from lab.inference.posterior import LIKELIER
 from lab.observables.observable import measurement_title
 from sim.effects.base import Effect
+from sim.effects.empirical_law import EmpiricalLaw
 from sim.spectrum import FloatArray
 
 #: Standard deviations by which a process has to depart from none at a node to be told beside the one that shows most.
@@ -50,8 +51,8 @@ class Law:
 
 @dataclass(frozen=True)
 class _Shown:
-    """A process with its posterior mean and standard deviation at its nodes (k,), and the blocks that show it, strongest
-    first, with the chi2 of its change."""
+    """A process with its posterior mean and standard deviation at its nodes (k,), and the blocks that show it, the
+    strongest first, with the chi2 of its change."""
 
     process: Process
     mean: FloatArray
@@ -101,59 +102,83 @@ def _shown(reading: SideTable, delta: Delta, group: int) -> Iterator[_Shown]:
             yield one
 
 
+@dataclass(frozen=True)
+class _Curve:
+    """A process as the result lists it: place, points, the law's table there, departures from none with their standard
+    deviations in the unit in which they are shown. `curve_of`, `labels`: of one measurement's numbers."""
+
+    stage: str
+    along: str
+    of: str
+    at: tuple[float, ...]
+    table: FloatArray
+    departure: FloatArray
+    std: FloatArray
+    period: int = 0
+    curve_of: str = ""
+    labels: tuple[str, ...] = ()
+
+
 def _law(
     reading: SideTable, group: int, shown: _Shown, probability: float, names: Sequence[str],
     judged: CurvePrediction | None,
 ) -> Law:  # fmt: skip
-    state, curve = reading.table.groups[group], shown.process.curve
-    fields = _of_state(reading, curve, shown) if isinstance(curve, StateCurve) else _of_observable(curve, shown)
-    stage, along, of = fields["stage"], fields["along"], fields["of"]
+    curve, state = shown.process.curve, reading.table.groups[group]
+    one = _of_state(reading, curve, shown) if isinstance(curve, StateCurve) else _of_observable(curve, shown)
     before, after, n = _chi2_of(reading, shown, judged)
-    suspects = suspects_of_place(stage, along, of, "curve")
+    form = "periodic" if one.period else "curve"
     told = DiscoveredLaw(
-        side=reading.side, **fields, chi2_before=before, chi2_after=after, n=n, own_chi2_before=before,
-        own_chi2_after=after, own_n=n, measurements=tuple(sorted(names)), suspects=suspects, statement="", state=state,
+        side=reading.side,
+        stage=one.stage,
+        along=one.along,
+        of=one.of,
+        form=form,
+        period=one.period,
+        at=one.at,
+        table=tuple(one.table.tolist()),
+        shown_period=one.period,
+        shown_departure=tuple(one.departure.tolist()),
+        shown_std=tuple(one.std.tolist()),
+        chi2_before=before,
+        chi2_after=after,
+        n=n,
+        own_chi2_before=before,
+        own_chi2_after=after,
+        own_n=n,
+        measurements=tuple(sorted(names)),
+        suspects=suspects_of_place(one.stage, one.along, one.of, form),
+        statement="",
+        state=state,
         probability=round(probability, 6),
-    )  # fmt: skip
-    said = _statement(told, suspects, probability, is_held_out=judged is not None)
-    effect = None
-    if isinstance(curve, StateCurve) and not isinstance(curve, BordersCurve):
-        effect = curve.law(shown.mean)
-    return Law(group, told.model_copy(update={"statement": said}), effect)
+        curve_of=one.curve_of,
+        labels=one.labels,
+    )
+    said = _statement(told, probability, is_held_out=judged is not None)
+    is_of_camera = isinstance(curve, StateCurve) and not isinstance(curve, BordersCurve)
+    return Law(group, told.model_copy(update={"statement": said}), curve.law(shown.mean) if is_of_camera else None)
 
 
-def _of_state(reading: SideTable, curve: StateCurve, shown: _Shown) -> dict[str, object]:
-    """Return the fields of a law on a state of the chain: at its points, fixed ones included."""
-    camera = reading.used.camera
+def _of_state(reading: SideTable, curve: StateCurve, shown: _Shown) -> _Curve:
+    """Return a law on a state of the chain, at all its points."""
+    gain = reading.used.camera.conversion_gain_dn_per_e
     unit = departure_unit(curve.stage, curve.along, curve.of, bool(curve.at))
-    gain = camera.conversion_gain_dn_per_e
     factor = {"DN": gain, "DN/s": gain, "DN^2": gain**2}.get(unit, 1.0)
-    change = curve.change(shown.mean)
-    std = np.abs(curve.change(shown.std))
+    change, std = curve.change(shown.mean), np.abs(curve.change(shown.std))
     law = curve.law(shown.mean)
-    return {
-        "stage": curve.stage, "along": curve.along, "of": curve.of, "form": "periodic" if curve.period else "curve",
-        "period": curve.period, "at": curve.at, "shown_period": curve.period,
-        "table": getattr(law, "table", tuple((curve.none + change).tolist())),
-        "shown_departure": tuple((factor * change).tolist()), "shown_std": tuple((factor * std).tolist()),
-    }  # fmt: skip
+    table = np.array(law.table) if isinstance(law, EmpiricalLaw) else curve.none + change
+    return _Curve(curve.stage, curve.along, curve.of, curve.at, table, factor * change, factor * std, curve.period)
 
 
-def _of_observable(curve: ObservableCurve, shown: _Shown) -> dict[str, object]:
-    """Return the fields of a curve of one measurement's used numbers, in its quantity: by channel and condition, along
-    its axis."""
+def _of_observable(curve: ObservableCurve, shown: _Shown) -> _Curve:
+    """Return a curve of one measurement's used numbers, in its quantity: by channel and condition, along its axis."""
     measurement, used = curve.measurement, curve.used
     labels = [" ".join(dict.fromkeys((label.channel, label.condition))).strip() for label in curve.labels[:used]]
-    order = sorted(range(used), key=lambda k: (labels[k], curve.labels[k].x))
+    order = np.array(sorted(range(used), key=lambda k: (labels[k], curve.labels[k].x)), int)
     departure, std = (curve.scale[order] * v[order] for v in (shown.mean, shown.std))
-    place = PLACES_OF.get(measurement.name)
-    stage, along, of = place or ("image", measurement.axis.replace("_", " "), "mean")
-    return {
-        "stage": stage, "along": along, "of": of, "form": "curve", "period": 0, "shown_period": 0,
-        "at": tuple(curve.labels[k].x for k in order), "table": tuple(departure.tolist()),
-        "shown_departure": tuple(departure.tolist()), "shown_std": tuple(std.tolist()),
-        "curve_of": measurement.name, "labels": tuple(labels[k] for k in order),
-    }  # fmt: skip
+    stage, along, of = PLACES_OF.get(measurement.name, ("image", measurement.axis.replace("_", " "), "mean"))
+    at = tuple(curve.labels[k].x for k in order)
+    of_each = tuple(labels[k] for k in order)
+    return _Curve(stage, along, of, at, departure, departure, std, curve_of=measurement.name, labels=of_each)
 
 
 def _chi2_of(reading: SideTable, shown: _Shown, judged: CurvePrediction | None) -> tuple[float, float, int]:
@@ -165,7 +190,7 @@ def _chi2_of(reading: SideTable, shown: _Shown, judged: CurvePrediction | None) 
     return shown.chi2 + n, float(n), n
 
 
-def _statement(law: DiscoveredLaw, suspects: str, probability: float, *, is_held_out: bool) -> str:
+def _statement(law: DiscoveredLaw, probability: float, *, is_held_out: bool) -> str:
     """Say where the law acts, how large it is and where, what may do that, and what it predicts."""
     departure, std = np.array(law.shown_departure), np.array(law.shown_std)
     k = int(np.argmax(np.abs(departure) / np.maximum(std, 1e-300)))
@@ -183,9 +208,9 @@ def _statement(law: DiscoveredLaw, suspects: str, probability: float, *, is_held
             unit = coordinate_unit(law.stage, law.along, law.of)
             where = f"{law.at[k % len(law.at)]:.4g} {unit}".strip()
     told = [
-        f"No named effect accounts for this: {what} by {size} ({where}); something unlisted acts on the {law.state} with "
-        f"probability {probability:.3f}.",
-        f"{suspects[0].upper()}{suspects[1:]}.",
+        f"No named effect accounts for this: {what} by {size} ({where}).",
+        f"Something unlisted acts on the {law.state} with probability {probability:.3f}.",
+        f"{law.suspects[0].upper()}{law.suspects[1:]}.",
     ]
     if is_held_out:
         places = " and ".join(measurement_title(name) for name in law.measurements)

@@ -117,8 +117,8 @@ def suspects_of_place(stage: str, along: str, of: str, form: str) -> str:
 
 def coordinate_unit(stage: str, along: str, of: str) -> str:
     """Return the unit of a curve's coordinate; "" where it has none."""
-    place = PLACES.get((stage, along, of))  # type: ignore[call-overload]
-    return "" if place is None else place[2].split(" after ")[0].split(" from ")[0]
+    said = {(str(s), str(a), str(o)): words for (s, a, o), (_, _, words) in PLACES.items()}.get((stage, along, of), "")
+    return said.split(" after ")[0].split(" from ")[0]
 
 
 def departure_unit(stage: str, along: str, of: str, is_curve: bool) -> str:

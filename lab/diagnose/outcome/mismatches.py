@@ -21,7 +21,6 @@ from lab.diagnose.inference.weigh import UNKNOWN, Candidate
 from lab.diagnose.outcome.corrections import Correction
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
-from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
     GeometryFit,
