@@ -82,6 +82,8 @@ def read_table(table: Table, hypotheses: Mapping[str, Hypothesis]) -> Posterior:
     for tail in table.tails:
         for name in tail.members:
             effects[name] = effects.get(name, 0.0) + tail.probability
+        for g, share in tail.unlisted.items():
+            unlisted[table.groups[g]] = unlisted.get(table.groups[g], 0.0) + tail.probability * share
         for name, share in tail.effects.items():
             effects[name] = effects.get(name, 0.0) + tail.probability * share
         held_families = {hypotheses[name].family for name in tail.members}

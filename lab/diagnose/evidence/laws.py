@@ -6,7 +6,7 @@ their nodes, what the mean takes off chi2 of held-out captures, and the effect t
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,19 +51,35 @@ class Law:
 
 @dataclass(frozen=True)
 class _Shown:
-    """A process with its posterior mean and standard deviation at its nodes (k,), and the blocks that show it, the
+    """A process with its posterior mean (k,) and covariance (k, k) at its nodes, and the blocks that show it, the
     strongest first, with the chi2 of its change."""
 
     process: Process
     mean: FloatArray
-    std: FloatArray
+    covariance: FloatArray
     blocks: tuple[int, ...]
     chi2: float
 
     @property
+    def std(self) -> FloatArray:
+        """Standard deviations at the nodes (k,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def steepest(self) -> tuple[int, int, float, float]:
+        """The two nodes whose difference is the most standard deviations, the higher first, that difference and its
+        standard deviation. A level that all nodes share may be undetermined, as a gain takes it up."""
+        variance = np.diag(self.covariance)
+        std = np.sqrt(np.maximum(variance[:, None] + variance - 2.0 * self.covariance, 1e-12 * variance.max()))
+        apart = self.mean[:, None] - self.mean
+        i, j = divmod(int(np.argmax(apart / std)), len(self.mean))
+        return i, j, float(apart[i, j]), float(std[i, j])
+
+    @property
     def sigma(self) -> float:
-        """Largest departure from none, in standard deviations."""
-        return float(np.max(np.abs(self.mean) / np.maximum(self.std, 1e-300)))
+        """Largest difference of two nodes, in its standard deviations."""
+        _, _, apart, std = self.steepest
+        return apart / std
 
 
 def laws_of(reading: SideTable) -> tuple[Law, ...]:
@@ -95,7 +111,7 @@ def _shown(reading: SideTable, delta: Delta, group: int) -> Iterator[_Shown]:
         least = max(SHOWN_CHI2, SHOWN_SHARE * by_block[order[0]])
         blocks = tuple(k for k in order if by_block[k] > least) or tuple(order[:1])
         mean, covariance = delta.at_nodes(process)
-        found.append(_Shown(process, mean, np.sqrt(np.diag(covariance)), blocks, float(power.sum())))
+        found.append(_Shown(process, mean, covariance, blocks, float(power.sum())))
     found.sort(key=lambda one: -one.chi2)
     for k, one in enumerate(found):
         if not k or (one.chi2 > max(SHOWN_CHI2, SHOWN_SHARE * found[0].chi2) and one.sigma > TOLD_SIGMA):
@@ -105,7 +121,8 @@ def _shown(reading: SideTable, delta: Delta, group: int) -> Iterator[_Shown]:
 @dataclass(frozen=True)
 class _Curve:
     """A process as the result lists it: place, points, the law's table there, departures from none with their standard
-    deviations in the unit in which they are shown. `curve_of`, `labels`: of one measurement's numbers."""
+    deviations in the unit in which they are shown. `curve_of`, `labels`: of one measurement's numbers. `size`: in
+    words."""
 
     stage: str
     along: str
@@ -117,6 +134,7 @@ class _Curve:
     period: int = 0
     curve_of: str = ""
     labels: tuple[str, ...] = ()
+    size: str = ""
 
 
 def _law(
@@ -153,7 +171,7 @@ def _law(
         curve_of=one.curve_of,
         labels=one.labels,
     )
-    said = _statement(told, probability, is_held_out=judged is not None)
+    said = _statement(told, one.size, is_held_out=judged is not None)
     is_of_camera = isinstance(curve, StateCurve) and not isinstance(curve, BordersCurve)
     return Law(group, told.model_copy(update={"statement": said}), curve.law(shown.mean) if is_of_camera else None)
 
@@ -166,7 +184,10 @@ def _of_state(reading: SideTable, curve: StateCurve, shown: _Shown) -> _Curve:
     change, std = curve.change(shown.mean), np.abs(curve.change(shown.std))
     law = curve.law(shown.mean)
     table = np.array(law.table) if isinstance(law, EmpiricalLaw) else curve.none + change
-    return _Curve(curve.stage, curve.along, curve.of, curve.at, table, factor * change, factor * std, curve.period)
+    size = _size_of_state(curve, shown, factor, unit)
+    return _Curve(
+        curve.stage, curve.along, curve.of, curve.at, table, factor * change, factor * std, curve.period, size=size
+    )
 
 
 def _of_observable(curve: ObservableCurve, shown: _Shown) -> _Curve:
@@ -178,7 +199,8 @@ def _of_observable(curve: ObservableCurve, shown: _Shown) -> _Curve:
     stage, along, of = PLACES_OF.get(measurement.name, ("image", measurement.axis.replace("_", " "), "mean"))
     at = tuple(curve.labels[k].x for k in order)
     of_each = tuple(labels[k] for k in order)
-    return _Curve(stage, along, of, at, departure, departure, std, curve_of=measurement.name, labels=of_each)
+    one = _Curve(stage, along, of, at, departure, departure, std, curve_of=measurement.name, labels=of_each)
+    return replace(one, size=_size_of_measurement(one))
 
 
 def _chi2_of(reading: SideTable, shown: _Shown, judged: CurvePrediction | None) -> tuple[float, float, int]:
@@ -190,26 +212,14 @@ def _chi2_of(reading: SideTable, shown: _Shown, judged: CurvePrediction | None) 
     return shown.chi2 + n, float(n), n
 
 
-def _statement(law: DiscoveredLaw, probability: float, *, is_held_out: bool) -> str:
-    """Say where the law acts, how large it is and where, what may do that, and what it predicts."""
-    departure, std = np.array(law.shown_departure), np.array(law.shown_std)
-    k = int(np.argmax(np.abs(departure) / np.maximum(std, 1e-300)))
+def _statement(law: DiscoveredLaw, size: str, *, is_held_out: bool) -> str:
+    """Say where the law acts, how large it is, what may do that, and what it predicts."""
+    what = f"the {quantity_of(law.stage, law.along, law.of)} by {law.along}"
     if law.curve_of:
-        what = f"{measurement_title(law.curve_of)} of the {law.side} camera departs"
-        size, where = f"{departure[k]:+.3g} ± {std[k]:.1g}", f"{law.labels[k]} at {law.at[k]:.4g}"
-    else:
-        unit = departure_unit(law.stage, law.along, law.of, bool(law.at))
-        factor, shown = (100.0, "%") if unit == "%" else (1.0, unit)
-        what = f"the {quantity_of(law.stage, law.along, law.of)} by {law.along} of the {law.side} camera departs"
-        size = f"{factor * departure[k]:+.3g} ± {factor * std[k]:.1g} {shown}"
-        if law.period:
-            where = f"{law.along} {k} of every {law.period}"
-        else:
-            unit = coordinate_unit(law.stage, law.along, law.of)
-            where = f"{law.at[k % len(law.at)]:.4g} {unit}".strip()
+        what = f"{measurement_title(law.curve_of)}"
     told = [
-        f"No named effect accounts for this: {what} by {size} ({where}).",
-        f"Something unlisted acts on the {law.state} with probability {probability:.3f}.",
+        f"No named effect accounts for this: {what} of the {law.side} camera {size}.",
+        f"Something unlisted acts on the {law.state} with probability {law.probability:.3f}.",
         f"{law.suspects[0].upper()}{law.suspects[1:]}.",
     ]
     if is_held_out:
@@ -219,3 +229,21 @@ def _statement(law: DiscoveredLaw, probability: float, *, is_held_out: bool) -> 
             f"{law.chi2_after:.0f}."
         )
     return " ".join(told)
+
+
+def _size_of_state(curve: StateCurve, shown: _Shown, factor: float, unit: str) -> str:
+    """Say by how much a law differs between the two nodes that are known best against each other."""
+    i, j, apart, std = shown.steepest
+    scale, said = (100.0, "%") if unit == "%" else (factor, unit)
+    size = f"{scale * curve.unit * apart:.3g} ± {scale * curve.unit * std:.1g} {said}"
+    if curve.period:
+        return f"repeats every {curve.period}, {curve.along} {i} {size} above {curve.along} {j}"
+    at, of = coordinate_unit(curve.stage, curve.along, curve.of), curve.at[curve.fixed :]
+    high, low = (f"{of[k % len(of)]:.4g}" for k in (i, j))
+    return f"is {size} higher at {high} {at} than at {low} {at}".replace("  ", " ")
+
+
+def _size_of_measurement(one: _Curve) -> str:
+    """Say by how much a measurement departs where that is the most standard deviations."""
+    k = int(np.argmax(np.abs(one.departure) / np.maximum(one.std, 1e-300)))
+    return f"departs by {one.departure[k]:+.3g} ± {one.std[k]:.1g} at {one.at[k]:.4g} ({one.labels[k]})"
