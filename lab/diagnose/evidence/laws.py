@@ -184,7 +184,7 @@ def _of_state(reading: SideTable, curve: StateCurve, shown: _Shown) -> _Curve:
     change, std = curve.change(shown.mean), np.abs(curve.change(shown.std))
     law = curve.law(shown.mean)
     table = np.array(law.table) if isinstance(law, EmpiricalLaw) else curve.none + change
-    size = _size_of_state(curve, shown, factor, unit)
+    size = _size_of_state(curve, shown, factor, unit, reading.used.camera.channels)
     return _Curve(
         curve.stage, curve.along, curve.of, curve.at, table, factor * change, factor * std, curve.period, size=size
     )
@@ -231,7 +231,9 @@ def _statement(law: DiscoveredLaw, size: str, *, is_held_out: bool) -> str:
     return " ".join(told)
 
 
-def _size_of_state(curve: StateCurve, shown: _Shown, factor: float, unit: str) -> str:
+def _size_of_state(
+    curve: StateCurve, shown: _Shown, factor: float, unit: str, channels: Sequence[str]
+) -> str:  # fmt: skip
     """Say by how much a law differs between the two nodes that are known best against each other."""
     i, j, apart, std = shown.steepest
     scale, said = (100.0, "%") if unit == "%" else (factor, unit)
@@ -239,8 +241,11 @@ def _size_of_state(curve: StateCurve, shown: _Shown, factor: float, unit: str) -
     if curve.period:
         return f"repeats every {curve.period}, {curve.along} {i} {size} above {curve.along} {j}"
     at, of = coordinate_unit(curve.stage, curve.along, curve.of), curve.at[curve.fixed :]
-    high, low = (f"{of[k % len(of)]:.4g}" for k in (i, j))
-    return f"is {size} higher at {high} {at} than at {low} {at}".replace("  ", " ")
+    high, low = (
+        f"{of[k % len(of)]:.4g} {at}".strip() + (f" in {channels[k // len(of)]}" if curve.curves > 1 else "")
+        for k in (i, j)
+    )
+    return f"is {size} higher at {high} than at {low}"
 
 
 def _size_of_measurement(one: _Curve) -> str:
