@@ -76,7 +76,7 @@ def lines(outcome: Outcome) -> Iterator[str]:
     )
     for row in table.rows[:5]:
         members = ", ".join(sorted(row.members)) or "none"
-        groups = f"; unlisted: {', '.join(table.groups[g] for g in sorted(row.unlisted))}" if row.unlisted else ""
+        groups = f"; unlisted: {', '.join(table.states(row.unlisted))}" if row.unlisted else ""
         yield f"    {row.probability:.4f}  {members}{groups}{'' if row.refitted else ' (closed form)'}"
     for kind in ("effect", "family", "unlisted"):
         found = [f for f in posterior.findings if f.kind == kind and f.probability > LISTED_PROBABILITY]

@@ -157,7 +157,7 @@ def _predict(
         [
             scaled_columns(problem.groups, tau, used),
             np.column_stack(
-                [t * g.held_out for g, t in zip(problem.groups, tau, strict=True) if g.held_out is not None]
+                [t * g.held_out for g, t in zip(problem.groups, tau, strict=True) if g.held_out is not None and t > 0.0]
             ),
         ]
     )

@@ -1,10 +1,13 @@
 """Small physics that no list has: groups of disturbances, each of a state of the chain of light, with everyday scales.
 
-A group's disturbance is a Gaussian process along the coordinate of its state: linear between nodes, whose values have a
-squared-exponential kernel of unit variance and a correlation length of two nodes (of the transmittance 15 nm). Its
-columns H are the changes of the whole prediction by it, so that an unlisted blur moves edges and screens by one
-function. Where no law of `sim` has the state (noise by line, defective pixels, codes), the process acts on the
-observables of that state, along their own axis, as a share of their scale."""
+The disturbances of a state are Gaussian processes, each along one coordinate: linear between nodes, whose values have a
+squared-exponential kernel of unit variance and a correlation length of two nodes (of the transmittance 15 nm). Their
+columns H are the changes of the whole prediction, so that an unlisted blur moves edges and screens by one function.
+Where no law of `sim` has the state (noise by line, defective pixels), a process acts on an observable of that state,
+along its own axis, as a share of its scale.
+
+What is everyday acts along all coordinates of a state, with one scale. What is unlisted acts along one of them: one
+large process doesn't make the others of its state probable."""
 
 from __future__ import annotations
 
@@ -37,6 +40,8 @@ _SPECTRAL_STEP_NM, _SPECTRAL_CORRELATED, _MOST_SPECTRAL = 10.0, 1.5, 48
 _TRANSFER_NODES = (0.0, 0.01, 0.03, 0.06, 0.12, 0.2, 0.32, 0.46, 0.64, 0.82, 1.0)
 #: Nodes about the axis: what has two lobes, as a saddle, is followed to 5 % by lines.
 _ANGLES = 16
+#: The most nodes by time, at captures, and their correlation length; the most of each channel's.
+_MOST_TIMES, _TIMES_CORRELATED, _FEW_TIMES = 20, 4.0, 7
 #: The most nodes by exposure.
 _MOST_EXPOSURES = 8
 #: Codes after which a table of their widths repeats: the longest period of the combs that are counted.
@@ -46,7 +51,9 @@ _RIMS_PX = (0.0, 0.3)
 #: Correlation between two channels, and between two conditions, of one observable.
 _BETWEEN = 0.7
 #: Columns of a group that are kept, by what they may change at its largest scale: variances, in the numbers' noise.
-MOST_COLUMNS, LEAST_VARIANCE = 24, 1e-2
+MOST_COLUMNS, MOST_ON_OBSERVABLE, LEAST_VARIANCE = 24, 12, 1e-2
+#: Largest everyday scale, in s_g, at which directions count.
+_EVERYDAY_MOST = 3.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,7 @@ TRANSFER, FIELD, SPECTRAL, LINES, RESPONSE, SOURCE, OFFSET, SHOT, ROWS, BORDERS 
     ),
     GroupDeclaration(
         "field", 0.0005, "1, of the irradiance by place, and of the shortest exposure",
-        "healthy sets: 0.03 % at most beside the free tilt and bow",
+        "healthy sets: 0.03 % at most beside the free tilt and bow", observables=("flat_field",),
     ),
     GroupDeclaration(
         "spectral", 0.002, "1, of the transmittance by wavelength",
@@ -88,7 +95,7 @@ TRANSFER, FIELD, SPECTRAL, LINES, RESPONSE, SOURCE, OFFSET, SHOT, ROWS, BORDERS 
     ),
     GroupDeclaration(
         "offset", 0.01, "read noise, of the offset by time, exposure and place",
-        "healthy sets: 0.007 at most", largest=10.0,
+        "healthy sets: 0.007 at most", largest=10.0, observables=("dark_field",),
     ),
     GroupDeclaration(
         "shot noise", 0.005, "1, of the temporal variance by level",
@@ -147,7 +154,8 @@ def groups_of(model: MeasurementModel, dataset: Dataset, used: int) -> tuple[Gro
     gaussian = model.gaussian((), where, 0.0)
     base = model.mean()
     declared: list[tuple[GroupDeclaration, list[_Columns]]] = [
-        (group, list(_on_state(model, base, curves(dataset)))) for group, curves in _ON_STATES.items()
+        (group, [*_on_state(model, base, curves(dataset)), *_on_observables(model, group.observables, used)])
+        for group, curves in _ON_STATES.items()
     ]
     taken = {name for group in ON_OBSERVABLES for name in group.observables}
     read = {b.measurement.name for b in model.blocks if b.reads and b.measurement.name not in taken}
@@ -158,52 +166,56 @@ def groups_of(model: MeasurementModel, dataset: Dataset, used: int) -> tuple[Gro
         declared.append((group, [*on_state, *_on_observables(model, group.observables or on_boards, used)]))
     found = []
     for group, processes in declared:
-        if not processes:
-            continue
-        columns = np.column_stack([p.columns for p in processes])
-        vectors = _strongest(gaussian.whiten(columns[where]), group.largest)
-        if vectors.shape[1]:
-            kept = columns @ vectors
-            found.append(
-                Group(
-                    group.name, kept[where], group.everyday, group.unit, group.source, group.largest, kept[~where],
-                    tuple(_of_group(processes, vectors, where)),
-                )
-            )  # fmt: skip
+        if processes:
+            white = gaussian.whiten(np.column_stack([p.columns[where] for p in processes]))
+            found += list(_groups_of_state(group, processes, white, where))
     return tuple(found)
+
+
+def _groups_of_state(
+    declared: GroupDeclaration, processes: Sequence[_Columns], white: FloatArray, used: np.ndarray
+) -> Iterator[Group]:
+    """Yield what is everyday on a state, of all processes together, and each process by itself, which is unlisted.
+    `white`: their columns at the `used` numbers, whitened."""
+    name, unit, source = declared.name, declared.unit, declared.source
+    vectors = _strongest(white, _EVERYDAY_MOST * declared.everyday, MOST_COLUMNS)
+    if vectors.shape[1]:
+        kept = np.column_stack([p.columns for p in processes]) @ vectors
+        yield Group(name, kept[used], declared.everyday, unit, source, 0.0, kept[~used])
+    first = 0
+    for p in processes:
+        count = p.columns.shape[1]
+        own = _strongest(white[:, first : first + count], declared.largest, p.most)
+        first += count
+        if own.shape[1]:
+            kept = p.columns @ own
+            process = Process(p.factor @ own, p.factor @ (np.eye(count) - own @ own.T) @ p.factor.T, p.curve)
+            yield Group(
+                name, kept[used], 0.0, unit, source, declared.largest, kept[~used], process, 3.0 * declared.everyday
+            )  # fmt: skip
 
 
 def _is_of_boards(model: MeasurementModel, name: str) -> bool:
     return any(b.measurement.name == name and b.measurement.order >= 500 for b in model.blocks)
 
 
-def _strongest(white: FloatArray, largest: float) -> FloatArray:
-    """Return the principal directions (R, r) of a group's columns (n, R) that may change the numbers beyond their
-    noise."""
+def _strongest(white: FloatArray, largest: float, most: int) -> FloatArray:
+    """Return the principal directions (R, r), `most` at most, of columns (n, R) that may change the numbers beyond
+    their noise at a scale `largest`."""
     size, vectors = eigh(white.T @ white)
-    kept = np.flatnonzero(largest**2 * size > LEAST_VARIANCE)[-MOST_COLUMNS:]
+    kept = np.flatnonzero(largest**2 * size > LEAST_VARIANCE)[-most:]
     return np.asarray(vectors[:, kept])
 
 
 @dataclass(frozen=True)
 class _Columns:
     """Columns (n, m) of one process: changes of the numbers by independent standard normal coefficients. `factor` (k,
-    m): those coefficients -> the process at its nodes."""
+    m): those coefficients -> the process at its nodes. `most`: directions that are kept."""
 
     columns: FloatArray
     factor: FloatArray
     curve: StateCurve | ObservableCurve
-
-
-def _of_group(processes: Sequence[_Columns], vectors: FloatArray, used: np.ndarray) -> Iterator[Process]:
-    """Yield the processes of a group of which the directions `vectors` (R, r) of all columns are kept. `used`: mask of
-    the numbers."""
-    first = 0
-    for p in processes:
-        own = vectors[first : first + p.columns.shape[1]]
-        first += len(own)
-        rest = p.factor @ (np.eye(len(own)) - own @ own.T) @ p.factor.T
-        yield Process(p.factor @ own, rest, p.columns[used] @ own, p.curve)
+    most: int
 
 
 # --- processes on states of the chain ---------------------------------------------------------------------------------
@@ -229,6 +241,7 @@ class StateCurve:
     fixed: int = 0
     curves: int = 1
     correlated: float = _NODES_CORRELATED
+    may_jump: bool = False  # Ornstein and Uhlenbeck's process in the place of a smooth one
 
     @property
     def nodes(self) -> int:
@@ -256,7 +269,8 @@ class StateCurve:
         apart = np.abs(x[:, None] - x)
         if self.is_closed:  # the chord, so that the kernel is positive definite
             apart = len(x) / np.pi * np.sin(np.pi * apart / len(x))
-        own = np.exp(-0.5 * np.square(apart / self.correlated)) + 1e-6 * np.eye(len(x))
+        fall = apart / self.correlated if self.may_jump else 0.5 * np.square(apart / self.correlated)
+        own = np.exp(-fall) + 1e-6 * np.eye(len(x))
         return np.kron(np.eye(self.curves), own)
 
     def change(self, values: FloatArray) -> FloatArray:
@@ -313,7 +327,7 @@ def _on_state(model: MeasurementModel, base: FloatArray, curves: Iterator[StateC
         table = np.column_stack(own)
         if table.any():
             factor = np.asarray(np.linalg.cholesky(curve.kernel), float)
-            yield _Columns(table @ factor, factor, curve)
+            yield _Columns(table @ factor, factor, curve, max(MOST_COLUMNS, curve.period))
 
 
 def _points(at: Sequence[float] | FloatArray) -> tuple[float, ...]:
@@ -381,19 +395,22 @@ def _response(dataset: Dataset) -> Iterator[StateCurve]:
 
 def _times_s(dataset: Dataset) -> tuple[float, ...]:
     times = sorted({dataset.elapsed_s(c) for c in dataset.recordings.captures(side=dataset.side)})
-    return _points(np.linspace(0.0, max(times[-1], 1.0), 7))
+    few = np.unique(np.linspace(0, len(times) - 1, _MOST_TIMES).round().astype(int))
+    return _points(np.array(times)[few]) if len(few) > 1 else (0.0, max(times[-1], 1.0))
 
 
 def _source(dataset: Dataset) -> Iterator[StateCurve]:
     at = _times_s(dataset)
-    yield StateCurve("light", "time", "mean", at)
+    yield StateCurve("light", "time", "mean", at, correlated=_TIMES_CORRELATED, may_jump=True)
     if len(dataset.channels) > 1:
-        yield StateCurve("light", "plane x time", "mean", at, curves=len(dataset.channels))
+        few = at[:: max(len(at) // _FEW_TIMES, 1)]
+        yield StateCurve("light", "plane x time", "mean", few, curves=len(dataset.channels))
 
 
 def _offset(dataset: Dataset) -> Iterator[StateCurve]:
     unit, corner_um = dataset.camera.read_noise_e, _corner_um(dataset)
-    yield StateCurve("signal", "time", "mean", _times_s(dataset), unit)
+    at = _times_s(dataset)
+    yield StateCurve("signal", "time", "mean", at, unit, correlated=_TIMES_CORRELATED, may_jump=True)
     yield StateCurve("signal", "radius", "mean", _points(np.linspace(0.0, corner_um, 4)), unit)
     yield StateCurve("signal", "row", "mean", _points(np.linspace(0.0, 1.0, 6)), unit)
     yield StateCurve("signal", "column", "mean", _points(np.linspace(0.0, 1.0, 6)), unit)
@@ -460,7 +477,8 @@ def _on_observables(model: MeasurementModel, names: Sequence[str], used: int) ->
         own = np.zeros((n, len(kept)))
         own[where] = scale[:, None] * factor
         labels = tuple(label for b in blocks for label in b.labels)
-        yield _Columns(own, factor, ObservableCurve(blocks[0].measurement, labels, scale, int(np.sum(where < used))))
+        curve = ObservableCurve(blocks[0].measurement, labels, scale, int(np.sum(where < used)))
+        yield _Columns(own, factor, curve, MOST_ON_OBSERVABLE)
 
 
 def observable_kernel(*blocks: Observable) -> FloatArray:

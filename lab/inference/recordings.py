@@ -225,7 +225,10 @@ def search_side(
 ) -> tuple[Search, Table]:
     """Run the search on one side. `everyday`: factor to all everyday scales, to see what depends on them."""
     hypotheses = hypotheses_of(problem.measured)
-    groups = tuple(replace(group, everyday=everyday * group.everyday) for group in problem.groups)
+    groups = tuple(
+        replace(g, everyday=everyday * g.everyday, least=None if g.least is None else everyday * g.least)
+        for g in problem.groups
+    )
     model = SideModel(problem.measured, groups)
     prior = SetPrior({name: h.family for name, h in hypotheses.items()})
     search = Search(model, hypotheses, prior, report=report)

@@ -189,19 +189,19 @@ class Row:
 class Tail:
     """All sets of three or more members more than `members` of which the recordings say little, together: their
     probability, and by hypothesis the share that holds it, by family the share that holds any of it, by group the share
-    in which it is unlisted."""
+    in which something unlisted acts on a state."""
 
     members: frozenset[str]
     probability: float
     effects: Mapping[str, float]
     families: Mapping[str, float]
-    unlisted: Mapping[int, float] = field(default_factory=dict)
+    unlisted: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Table:
     """All sets with their probabilities, likeliest first, and the fits of those that were refitted. `tails`: larger
-    sets, which aren't listed one by one."""
+    sets, which aren't listed one by one. `groups`: the state of each group."""
 
     rows: tuple[Row, ...]
     tails: tuple[Tail, ...]
@@ -209,6 +209,14 @@ class Table:
     groups: tuple[str, ...]
     log_evidence: float
     refits: int
+
+    def states(self, unlisted: frozenset[int]) -> tuple[str, ...]:
+        """Return the states on which these groups act."""
+        return tuple(dict.fromkeys(self.groups[g] for g in sorted(unlisted)))
+
+    def groups_on(self, state: str) -> frozenset[int]:
+        """Return the groups that act on a state."""
+        return frozenset(g for g, name in enumerate(self.groups) if name == state)
 
     @property
     def left(self) -> float:
@@ -837,10 +845,10 @@ class Search:
             families.setdefault(self.hypotheses[name].family, []).append(name)
         effects = {n: 1.0 - mass((n,)) / whole for n in gains}
         held = {f: 1.0 - mass(names) / whole for f, names in families.items()}
-        unlisted: dict[int, float] = {}
+        unlisted: dict[str, float] = {}
         for groups, value in origin.by_groups.items():
-            for g in groups:
-                unlisted[g] = unlisted.get(g, 0.0) + float(np.exp(value - origin.total))
+            for name in {self.model.groups[g].name for g in groups}:
+                unlisted[name] = unlisted.get(name, 0.0) + float(np.exp(value - origin.total))
         return Tail(origin.members, origin.quick + float(np.log(whole)), effects, held, unlisted)
 
 

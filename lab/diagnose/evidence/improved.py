@@ -27,7 +27,6 @@ from lab.formats.camera_model import camera_model, remarks_on_values
 from lab.formats.model_posterior import NameInDoubt, RivalModel, StoredEffect
 from lab.formats.results import FitResult
 from lab.inference.model import scaled_columns
-from lab.inference.posterior import LIKELIER
 from lab.inference.search import FittedSet
 from lab.observables.flats.stated_light import most_frequent_gain_db
 from lab.observables.spectra.curves import freed_curve
@@ -66,11 +65,7 @@ def improve(
     laws = frozenset(cause.effect.name for cause in named)
     found = reading.fit_of(laws) or _likeliest_with(reading, laws)
     effects = tuple(e for e in reading.effects_of(found.state) if e.name in laws)
-    unlisted = frozenset(
-        reading.table.groups.index(f.name)
-        for f in reading.posterior.findings
-        if f.kind == "unlisted" and f.probability >= LIKELIER
-    )
+    unlisted = frozenset(law.group for law in without_name)
     tau = found.likeliest.scales.mode(unlisted)
     disturbances = scaled_columns(reading.problem.groups, tau, len(reading.used.value))
     camera, corrections = _camera(reading, fit, baseline, effects, disturbances, without_name)
@@ -112,9 +107,8 @@ def _camera(
     acting: list[Effect] = [*always, *(nearest_form(e, estimates) for e in effects)]
     corrections: list[Correction] = []
     laws: list[Effect] = []
-    for g in dict.fromkeys(law.group for law in without_name):
-        name = reading.table.groups[g]
-        mine = [law for law in without_name if law.group == g]
+    for name in dict.fromkeys(law.told.state for law in without_name):
+        mine = [law for law in without_name if law.told.state == name]
         factor = _noise_factor(reading, effects, estimates, change, camera) if name == SHOT_NOISE else None
         own = [law.effect for law in mine if law.effect is not None] if factor is None else [factor]
         laws += own

@@ -5,7 +5,7 @@ their nodes, what the mean takes off chi2 of held-out captures, and the effect t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,14 +24,16 @@ from sim.effects.base import Effect
 from sim.effects.empirical_law import EmpiricalLaw
 from sim.spectrum import FloatArray
 
-#: Standard deviations by which a process has to depart from none at a node to be told beside the one that shows most.
-TOLD_SIGMA = 3.0
+#: Probability, given that something unlisted acts on a state, from which on another process is told as possible.
+LEAST_OTHER = 0.05
 #: Stage and index of the chain that observables are of whose axis is another one, a spatial frequency or a level.
 PLACES_OF: dict[str, tuple[str, str, str]] = {
     "dark_row_noise": ("signal", "row", "variance"),
     "dark_column_noise": ("signal", "column", "variance"),
     "dark_row_pattern": ("signal", "row", "mean"),
     "dark_column_pattern": ("signal", "column", "mean"),
+    "dark_field": ("signal", "place", "mean"),
+    "flat_field": ("image", "place", "mean"),
     "flat_rows": ("light", "row", "mean"),
     "flat_lines": ("charge", "column", "mean"),
     "code_density": ("codes", "code", "mean"),
@@ -75,47 +77,46 @@ class _Shown:
         i, j = divmod(int(np.argmax(apart / std)), len(self.mean))
         return i, j, float(apart[i, j]), float(std[i, j])
 
-    @property
-    def sigma(self) -> float:
-        """Largest difference of two nodes, in its standard deviations."""
-        _, _, apart, std = self.steepest
-        return apart / std
-
 
 def laws_of(reading: SideTable) -> tuple[Law, ...]:
-    """Return the laws without a name, by state the one that shows most first."""
+    """Return the laws without a name, by state the likeliest first."""
     found: list[Law] = []
     for finding in reading.posterior.findings:
         if finding.kind != "unlisted" or finding.probability < LIKELIER:
             continue
-        group = reading.table.groups.index(finding.name)
-        delta = delta_of(reading.table, reading.model, group)
-        if delta is not None:
-            shown = list(_shown(reading, delta, group))
-            names = tuple(dict.fromkeys(reading.used.blocks[k].measurement.name for s in shown for k in s.blocks))
-            judged = predict_by_curve(reading.problem, reading.search, reading.table, group, names)
-            found += [_law(reading, group, one, finding.probability, names, judged) for one in shown]
+        odds = _odds_of_processes(reading, finding.name)
+        told = [g for g, p in odds.items() if p >= LIKELIER] or list(odds)[:1]
+        others = [g for g, p in odds.items() if g not in told and p >= LEAST_OTHER]
+        for group in told:
+            delta = delta_of(reading.table, reading.model, group)
+            if delta is not None:
+                found.append(_law(reading, group, delta, finding.probability, others if len(told) == 1 else ()))
     return tuple(found)
 
 
-def _shown(reading: SideTable, delta: Delta, group: int) -> Iterator[_Shown]:
-    """Yield the processes of a group whose change stands out of the noise, the one that changes most first; only that,
-    where none does."""
-    model = reading.used
+def _odds_of_processes(reading: SideTable, state: str) -> dict[int, float]:
+    """Return the groups of a state with the probability that each is unlisted, given that any is, likeliest first."""
+    found: dict[int, float] = {}
+    total = 0.0
+    for row in reading.table.rows:
+        own = row.unlisted & reading.table.groups_on(state)
+        total += row.probability if own and row.refitted else 0.0
+        for g in own if row.refitted else ():
+            found[g] = found.get(g, 0.0) + row.probability
+    return {g: p / total for g, p in sorted(found.items(), key=lambda item: -item[1]) if total > 0.0}
+
+
+def _shown(reading: SideTable, delta: Delta, group: int) -> _Shown:
+    """Return a process with the blocks that its change stands out in."""
+    model, own = reading.used, reading.model.groups[group]
+    assert own.process is not None
     variance = np.concatenate([np.diag(b.covariance) for b in model.blocks])
-    found = []
-    for process in reading.model.groups[group].processes:
-        power = np.square(process.columns @ delta.mean) / variance
-        by_block = {k: float(power[at].sum()) for k, at in enumerate(model.slices)}
-        order = sorted(by_block, key=lambda k: -by_block[k])
-        least = max(SHOWN_CHI2, SHOWN_SHARE * by_block[order[0]])
-        blocks = tuple(k for k in order if by_block[k] > least) or tuple(order[:1])
-        mean, covariance = delta.at_nodes(process)
-        found.append(_Shown(process, mean, covariance, blocks, float(power.sum())))
-    found.sort(key=lambda one: -one.chi2)
-    for k, one in enumerate(found):
-        if not k or (one.chi2 > max(SHOWN_CHI2, SHOWN_SHARE * found[0].chi2) and one.sigma > TOLD_SIGMA):
-            yield one
+    power = np.square(own.columns @ delta.mean) / variance
+    by_block = {k: float(power[at].sum()) for k, at in enumerate(model.slices)}
+    order = sorted(by_block, key=lambda k: -by_block[k])
+    least = max(SHOWN_CHI2, SHOWN_SHARE * by_block[order[0]])
+    blocks = tuple(k for k in order if by_block[k] > least) or tuple(order[:1])
+    return _Shown(own.process, *delta.at_nodes(own.process), blocks, float(power.sum()))
 
 
 @dataclass(frozen=True)
@@ -137,11 +138,11 @@ class _Curve:
     size: str = ""
 
 
-def _law(
-    reading: SideTable, group: int, shown: _Shown, probability: float, names: Sequence[str],
-    judged: CurvePrediction | None,
-) -> Law:  # fmt: skip
-    curve, state = shown.process.curve, reading.table.groups[group]
+def _law(reading: SideTable, group: int, delta: Delta, probability: float, others: Sequence[int]) -> Law:
+    shown, state = _shown(reading, delta, group), reading.table.groups[group]
+    names = tuple(dict.fromkeys(reading.used.blocks[k].measurement.name for k in shown.blocks))
+    judged = predict_by_curve(reading.problem, reading.search, reading.table, group, names)
+    curve = shown.process.curve
     one = _of_state(reading, curve, shown) if isinstance(curve, StateCurve) else _of_observable(curve, shown)
     before, after, n = _chi2_of(reading, shown, judged)
     form = "periodic" if one.period else "curve"
@@ -171,7 +172,7 @@ def _law(
         curve_of=one.curve_of,
         labels=one.labels,
     )
-    said = _statement(told, one.size, is_held_out=judged is not None)
+    said = _statement(told, one.size, [_axis(reading, g) for g in others], is_held_out=judged is not None)
     is_of_camera = isinstance(curve, StateCurve) and not isinstance(curve, BordersCurve)
     return Law(group, told.model_copy(update={"statement": said}), curve.law(shown.mean) if is_of_camera else None)
 
@@ -212,8 +213,19 @@ def _chi2_of(reading: SideTable, shown: _Shown, judged: CurvePrediction | None) 
     return shown.chi2 + n, float(n), n
 
 
-def _statement(law: DiscoveredLaw, size: str, *, is_held_out: bool) -> str:
-    """Say where the law acts, how large it is, what may do that, and what it predicts."""
+def _axis(reading: SideTable, group: int) -> str:
+    """Return what a process is of, and along what."""
+    process = reading.model.groups[group].process
+    curve = None if process is None else process.curve
+    if isinstance(curve, ObservableCurve):
+        return measurement_title(curve.measurement.name)
+    assert isinstance(curve, StateCurve)
+    return f"{quantity_of(curve.stage, curve.along, curve.of)} by {curve.along}"
+
+
+def _statement(law: DiscoveredLaw, size: str, others: Sequence[str], *, is_held_out: bool) -> str:
+    """Say where the law acts, how large it is, what may do that, and what it predicts. `others`: along what else it may
+    act."""
     what = f"the {quantity_of(law.stage, law.along, law.of)} by {law.along}"
     if law.curve_of:
         what = f"{measurement_title(law.curve_of)}"
@@ -222,6 +234,8 @@ def _statement(law: DiscoveredLaw, size: str, *, is_held_out: bool) -> str:
         f"Something unlisted acts on the {law.state} with probability {law.probability:.3f}.",
         f"{law.suspects[0].upper()}{law.suspects[1:]}.",
     ]
+    if others:
+        told.append(f"These captures don't tell it from a law of the {', or of the '.join(others)}.")
     if is_held_out:
         places = " and ".join(measurement_title(name) for name in law.measurements)
         told.append(

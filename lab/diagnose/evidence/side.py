@@ -245,7 +245,7 @@ def _models(reading: SideTable) -> SideModels:
                 effects=tuple(sorted(row.members)),
                 probability=row.probability,
                 refitted=row.refitted,
-                unlisted=tuple(table.groups[g] for g in sorted(row.unlisted)),
+                unlisted=table.states(row.unlisted),
             )
         )
     included = [f for f in reading.posterior.findings if f.kind == "effect" and f.probability >= 0.001]

@@ -32,8 +32,8 @@ def _group(kept: int = NODES) -> Group:
     hats = np.maximum(1.0 - np.abs(rng.uniform(0.0, NODES - 1.0, NUMBERS)[:, None] - np.arange(NODES)), 0.0)
     columns = 30.0 * hats @ factor
     vectors = np.linalg.eigh(columns.T @ columns)[1][:, -kept:]
-    process = Process(factor @ vectors, factor @ (np.eye(NODES) - vectors @ vectors.T) @ factor.T, columns @ vectors)
-    return Group("curve", columns @ vectors, 0.01, processes=(process,))
+    process = Process(factor @ vectors, factor @ (np.eye(NODES) - vectors @ vectors.T) @ factor.T)
+    return Group("curve", columns @ vectors, 0.01, process=process)
 
 
 def _distribution(group: Group, tau: float = TAU) -> Gaussian:
@@ -56,9 +56,9 @@ def test_it_is_the_conditional_of_the_joint_normal_distribution() -> None:
 def test_numbers_that_say_nothing_leave_the_prior(kept: int) -> None:
     """At its nodes the process has the kernel times tau^2, whatever directions of it are kept."""
     group = _group(kept)
-    silent = Group("curve", 1e-9 * group.columns, 0.01, processes=group.processes)
+    silent = Group("curve", 1e-9 * group.columns, 0.01, process=group.process)
     found = condition(_distribution(silent), np.ones(NUMBERS), silent, TAU)
-    mean, covariance = found.at_nodes(group.processes[0])
+    mean, covariance = found.at_nodes(group.process)
     np.testing.assert_allclose(mean, 0.0, atol=1e-6)
     np.testing.assert_allclose(covariance, TAU**2 * _kernel(), atol=1e-9)
 
@@ -66,7 +66,7 @@ def test_numbers_that_say_nothing_leave_the_prior(kept: int) -> None:
 def test_a_known_curve_is_recovered_within_what_it_says() -> None:
     """400 curves of the prior, each with its own noise: r' C^-1 r at the nodes has mean k and variance 2 k."""
     group, rng, draws = _group(), np.random.default_rng(2), 400
-    process, distribution = group.processes[0], _distribution(group)
+    process, distribution = group.process, _distribution(group)
     squares = []
     for _ in range(draws):
         d = TAU * rng.standard_normal(NODES)
