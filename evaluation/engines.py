@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.draw import recordings_of
-from evaluation.independent_simulator import LISTED, OUTSIDE, ConcealedCamera, Law
+from evaluation.independent_simulator import LISTED, OUTSIDE, UNLISTED, ConcealedCamera, Law
 from evaluation.own_chain import healthy_session
 from lab.diagnose import diagnose
 from lab.errors import InputError
@@ -84,7 +84,7 @@ def lines(outcome: Outcome) -> Iterator[str]:
     )
     for row in table.rows[:5]:
         members = ", ".join(sorted(row.members)) or "none"
-        groups = f"; unlisted: {', '.join(table.groups[g] for g in sorted(row.unlisted))}" if row.unlisted else ""
+        groups = f"; unlisted: {', '.join(table.states(row.unlisted))}" if row.unlisted else ""
         yield f"    {row.probability:.4f}  {members}{groups}{'' if row.refitted else ' (closed form)'}"
     for kind in ("effect", "family", "unlisted"):
         found = [f for f in posterior.findings if f.kind == kind and f.probability > LISTED_PROBABILITY]
@@ -125,10 +125,10 @@ def recordings_named(name: str) -> RecordingSet:
 
 
 def _law(name: str) -> type[Law]:
-    for law in (*LISTED, *OUTSIDE):
+    for law in (*LISTED, *OUTSIDE, *UNLISTED):
         if law.name == name:
             return law
-    known = ", ".join(sorted(law.name for law in (*LISTED, *OUTSIDE)))
+    known = ", ".join(sorted(law.name for law in (*LISTED, *OUTSIDE, *UNLISTED)))
     raise InputError(f"law {name!r}: isn't known; choose one of {known}")
 
 

@@ -106,6 +106,8 @@ def _merge_opposite(raw: FloatArray, scales: Sequence[float]) -> tuple[tuple[int
 def project_groups(gram: FloatArray, amplitude: FloatArray) -> FloatArray:
     """Return the Gram matrix of all columns after the first R with these marginalised, whose coefficients have the
     standard deviations `amplitude` (R,)."""
+    there = np.concatenate([amplitude > 0.0, np.ones(len(gram) - len(amplitude), bool)])
+    gram, amplitude = gram[np.ix_(there, there)], amplitude[amplitude > 0.0]
     at = len(amplitude)
     inner = np.eye(at) + amplitude[:, None] * gram[:at, :at] * amplitude
     across = amplitude[:, None] * gram[:at, at:]
@@ -248,7 +250,7 @@ class HealthyDraws:
         tau = np.array([[g.everyday] for g in groups]) * np.abs(rng.standard_normal((len(groups), draws)))
         delta = np.repeat(tau, sizes, axis=0) * rng.standard_normal((at, draws))
         residual = rng.standard_normal((len(white), draws)) + white[:, :at] @ delta
-        priors = ScaleIntegral.log_priors(len(groups), any_unlisted)
+        priors = ScaleIntegral.log_priors(groups, any_unlisted)
         scales = ScaleIntegral(gram[:at, :at], none, sizes, none, groups, priors)
         return cls(gram, white.T @ residual, np.square(residual).sum(axis=0), scales)
 
@@ -267,12 +269,14 @@ class HealthyDraws:
         middle = np.array([float(g.everyday_quantile(np.array(0.5))) for g in groups])
         flips = [np.zeros(draws)]
         for g, group in enumerate(groups):
+            if not group.may_be_unlisted:
+                continue
             points = [group.scales(u) for u in (False, True)]
             values = self.scales.profiles(g, middle, np.concatenate(points), self.projected[:at])
             values += np.log(np.concatenate([group.shares(u) for u in (False, True)]))[:, None]
             usual, other = np.split(values, [len(points[0])])
             more = logsumexp(other, axis=0) - logsumexp(usual, axis=0)
-            flips.append(more + self.scales.prior_log[1] - self.scales.prior_log[0])
+            flips.append(more + self.scales.prior_log[1, g] - self.scales.prior_log[0, g])
         gains = gains_of(self._odds(middle, signatures), hypotheses, signatures)
         return 1.0 / (np.exp(logsumexp(flips, axis=0)) + others_over_empty(gains, prior))
 
@@ -282,11 +286,13 @@ class HealthyDraws:
         both = np.concatenate([self.gram, self.projected], axis=1)
         at, draws = len(self.scales.gram), self.projected.shape[1]
         amplitude = np.repeat(tau, self.scales.group_sizes)
-        inner = np.eye(at) + amplitude[:, None] * self.gram[:at, :at] * amplitude
+        there = np.flatnonzero(amplitude)
+        amplitude = amplitude[there]
+        inner = np.eye(len(there)) + amplitude[:, None] * self.gram[np.ix_(there, there)] * amplitude
         solved = cho_solve(
-            cho_factor(inner, lower=True, check_finite=False), amplitude[:, None] * both[:at, at:], check_finite=False
+            cho_factor(inner, lower=True, check_finite=False), amplitude[:, None] * both[there, at:], check_finite=False
         )
-        left = both[at:, at:] - (amplitude[:, None] * self.gram[:at, at:]).T @ solved
+        left = both[at:, at:] - (amplitude[:, None] * self.gram[there, at:]).T @ solved
         split = left.shape[1] - draws
         found = np.empty((len(signatures), draws))
         for i, s in enumerate(signatures):

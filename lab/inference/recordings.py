@@ -210,7 +210,9 @@ def _in_time_order(recordings: RecordingSet, side: Side) -> list[Capture]:
 
 def _with_history(dataset: Dataset, order: list[Capture]) -> Dataset:
     """Return the dataset with all of the side's captures as its history: what frames before leave in a frame doesn't
-    ask whether they are held out. Their levels predict, and aren't data."""
+    ask whether they are held out, nor does the time since the first one. Their levels predict, and aren't data."""
+    times = [c.time for c in order if c.time is not None]
+    dataset.first_time = min(times, default=None)
     dataset.in_time_order = [c for c in order if c.id not in dataset.copies.ids]
     dataset.__dict__.pop("_before", None)
     return dataset
@@ -266,7 +268,10 @@ def search_side(
 ) -> tuple[Search, Table]:
     """Run the search on one side. `everyday`: factor to all everyday scales, to see what depends on them."""
     hypotheses = hypotheses_of(problem.measured) | hypotheses_of_statements(problem.numbers(problem.measured))
-    groups = tuple(replace(group, everyday=everyday * group.everyday) for group in problem.groups)
+    groups = tuple(
+        replace(g, everyday=everyday * g.everyday, least=None if g.least is None else everyday * g.least)
+        for g in problem.groups
+    )
     model = problem.side_model(groups)
     prior = SetPrior({name: h.family for name, h in hypotheses.items()})
     search = Search(model, hypotheses, prior, report=report)

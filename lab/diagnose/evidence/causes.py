@@ -187,7 +187,7 @@ def _rivals(reading: SideTable, names: frozenset[str]) -> tuple[tuple[str, float
         if row.members & names:
             continue
         instead = sorted(row.members - best)
-        unlisted = [f"unlisted physics of the {table.groups[g]}" for g in sorted(row.unlisted)]
+        unlisted = [f"unlisted physics of the {state}" for state in table.states(row.unlisted)]
         name = WITH.join(instead or unlisted) or NOTHING
         found[name] = found.get(name, 0.0) + row.probability
     listed = sorted(found.items(), key=lambda item: -item[1])

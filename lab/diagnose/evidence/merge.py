@@ -414,6 +414,7 @@ def _summary(
                 f"Unlisted physics acts on the {state.state} of the {state.side} camera, with probability "
                 f"{state.probability:.3f}; it shows in {places}."
             )
+    yield from (law.statement for law in lists.discovered)
     for item in lists.unexplained:
         place = f"{measurement_title(item.measurement)} of the {item.side} camera, {item.where}"
         yield f"Not explained: {place}: {item.shape}."

@@ -13,6 +13,7 @@ from lab.capture_kinds.base import Equipment
 from lab.diagnose.evidence.causes import Cause, causes_of
 from lab.diagnose.evidence.doubt import doubt_of
 from lab.diagnose.evidence.improved import Improved, improve
+from lab.diagnose.evidence.laws import laws_of
 from lab.diagnose.evidence.places import (
     contradicted,
     detectability,
@@ -180,7 +181,8 @@ def _findings(
     named = [cause for cause in causes if cause.probability >= NAMED]
     passed = passes(reading.checked)
     said = verdict(posterior, reading.least_nothing, passed)
-    improved = improve(reading, fit, baseline, named)
+    laws = laws_of(reading)
+    improved = improve(reading, fit, baseline, named, laws)
     after = reading.gaussian(improved.fit, improved.unlisted)
     before = examine_places(reading.used, reading.baseline)
     departs = said != "no_mismatch"
@@ -208,6 +210,7 @@ def _findings(
             mismatches=tuple(mismatches),
             unexplained=(*stated, *left),
             unlisted=tuple(unlisted),
+            discovered=tuple(law.told for law in laws),
             models=(_models(reading),),
             places=tuple(examined(reading, before, after)),
             measurements=tuple(measurement_fits(reading, after)),
@@ -261,7 +264,7 @@ def _models(reading: SideTable) -> SideModels:
                 effects=tuple(sorted(row.members)),
                 probability=row.probability,
                 refitted=row.refitted,
-                unlisted=tuple(table.groups[g] for g in sorted(row.unlisted)),
+                unlisted=table.states(row.unlisted),
             )
         )
     included = [f for f in reading.posterior.findings if f.kind == "effect" and f.probability >= 0.001]
