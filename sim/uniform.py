@@ -306,14 +306,27 @@ class Uniform:
     def _read_means(self, electrons: Mapping[str, float], at_px: tuple[float, float] | None = None) -> dict[str, float]:
         """Mean electrons that are read by channel, of even light of these; arguments as of `mixing_factors`."""
         down, across = (
-            _phase_means(comb, None if at_px is None else at_px[axis]) for axis, comb in enumerate(self.read_combs())
+            _lines_at(comb, None if at_px is None else at_px[axis]) for axis, comb in enumerate(self.read_combs())
         )
         read = down @ self.phases_of(electrons) @ across.T
-        return {c: float(np.mean([read[at] for at in mosaic.phases(self.camera.cfa)[c]])) for c in electrons}
+        where = mosaic.phases(self.camera.cfa)
+        return {c: sum(float(read[at]) for at in where[c]) / len(where[c]) for c in electrons}
 
     def phases_of(self, electrons: Mapping[str, float]) -> FloatArray:
         """Electrons (step, step) of the mosaic's phases after neighbouring pixels have shared those of even light, by
         channel, and before they are clocked out."""
+        if self.exchanges_charge:
+            return self._shared_phases(electrons)
+        parts = self._phases_of_one
+        return np.asarray(sum((e * parts[c] for c, e in electrons.items()), np.zeros(())))
+
+    @cached_property
+    def _phases_of_one(self) -> dict[str, FloatArray]:
+        """`phases_of` one electron in each channel, where what neighbours share is in proportion."""
+        channels = self.camera.channels
+        return {one: self._shared_phases({c: float(c == one) for c in channels}) for one in channels}
+
+    def _shared_phases(self, electrons: Mapping[str, float]) -> FloatArray:
         cfa, size, inner = self.camera.cfa, 12, slice(4, 8)
         tile = mosaic.assemble({c: np.full((size, size), level) for c, level in electrons.items()}, cfa)
         return phase_means(self._charge.move_charge(tile)[inner, inner], cfa)
@@ -325,18 +338,28 @@ class Uniform:
         return self._charge.read_combs(0, step), self._charge.read_combs(1, step)
 
     def light_of(self, read: Mapping[str, float]) -> dict[str, float]:
-        """Electrons of even light by channel of which these means are read: the inverse of `mixing_factors`. What
-        neighbours share is a small part, so that it is taken off until nothing changes."""
-        light = dict(read)
+        """Electrons of even light by channel of which these means are read: the inverse of `mixing_factors`.
+
+        Charge that unequal neighbours exchange isn't in proportion: the light is corrected until nothing changes."""
         if not self._charge.mixes:
-            return light
-        least = LEAST_UNMIXED * max(read.values(), default=0.0)
+            return dict(read)
+        channels = self.camera.channels
+        if not self.exchanges_charge:
+            return dict(zip(channels, (self._unmixing @ [read[c] for c in channels]).tolist(), strict=True))
+        light, least = dict(read), LEAST_UNMIXED * max(read.values(), default=0.0)
         for _ in range(MOST_UNMIXED):
             found = self._read_means(light)
             light = {c: max(value + read[c] - found[c], 0.0) for c, value in light.items()}
             if all(abs(read[c] - found[c]) <= least for c in light):
                 break
         return light
+
+    @cached_property
+    def _unmixing(self) -> FloatArray:
+        """Matrix from the means that are read to the light, by channel."""
+        channels = self.camera.channels
+        one = [self._read_means({c: float(c == lit) for c in channels}) for lit in channels]
+        return np.linalg.inv(np.array([[read[c] for read in one] for c in channels]))
 
     @property
     def trails(self) -> bool:
@@ -539,7 +562,7 @@ def phase_means(tile: FloatArray, cfa: Cfa) -> FloatArray:
     return np.asarray(tile.reshape(rows // step, step, cols // step, step).mean((0, 2)))
 
 
-def _phase_means(combs: FloatArray, at_px: float | None) -> FloatArray:
+def _lines_at(combs: FloatArray, at_px: float | None) -> FloatArray:
     """Electrons (step, step) that the lines of each phase read of those of each phase: means over all lines, or over
     the nearest ones of a place."""
     step, lines = combs.shape

@@ -12,6 +12,7 @@ from sim.detection import responsivity
 from sim.effects import library
 from sim.effects.ambient_light import AmbientLight
 from sim.effects.base import Effect
+from sim.effects.brighter_fatter import BrighterFatter
 from sim.effects.charge_transfer_inefficiency import ChargeTransferInefficiency
 from sim.effects.crosstalk import Crosstalk
 from sim.effects.exposure_offset import ExposureOffset
@@ -190,9 +191,11 @@ def test_mixing_is_the_mean_over_the_frame_or_that_of_a_place(
         assert factors == pytest.approx({c: means[c] / LEVELS[c] for c in LEVELS}, rel=1e-9)
 
 
-def test_the_light_of_a_signal_is_the_inverse_of_mixing(colour_camera: CameraModel) -> None:
-    """To the share of the brightest channel at which the search for it stops."""
-    model = Uniform(colour_camera, (TRAILS, Crosstalk(share_percent=1.0)))
+@pytest.mark.parametrize("more", [Crosstalk(share_percent=1.0), BrighterFatter(exchanged_percent=3.0)])
+def test_the_light_of_a_signal_is_the_inverse_of_mixing(colour_camera: CameraModel, more: Effect) -> None:
+    """To the share of the brightest channel at which the search for it stops, where charge is exchanged by how much
+    neighbours hold."""
+    model = Uniform(colour_camera, (TRAILS, more))
     read = {c: LEVELS[c] * factor for c, factor in model.mixing_factors(LEVELS).items()}
     assert abs(read["B"] / LEVELS["B"] - 1.0) > 0.1
     assert model.light_of(read) == pytest.approx(LEVELS, abs=2.0 * LEAST_UNMIXED * LEVELS["R"])

@@ -229,13 +229,15 @@ class _Greens:
         return [self._ratio(ratios[0])] * len(ratios)
 
     def _ratio(self, ratio: _Ratio) -> float:
-        dataset = self._dataset
-        light = self._light(ratio.mean)
-        tile = mosaic.assemble({c: np.full((TILE_ROWS, TILE_COLS), e) for c, e in light.items()}, dataset.camera.cfa)
-        tile = collected_mosaic(
-            dataset.camera, tile, self._effects, exposure_s=ratio.exposure_s, elapsed_s=ratio.elapsed_s
-        )
-        phases = phase_means(tile, dataset.camera.cfa)
+        light, cfa = self._light(ratio.mean), self._dataset.camera.cfa
+        if acting(self._effects, COLLECTED):
+            tile = mosaic.assemble({c: np.full((TILE_ROWS, TILE_COLS), e) for c, e in light.items()}, cfa)
+            tile = collected_mosaic(
+                self._dataset.camera, tile, self._effects, exposure_s=ratio.exposure_s, elapsed_s=ratio.elapsed_s
+            )
+            phases = phase_means(tile, cfa)
+        else:
+            phases = self._model.phases_of(light)
         red, blue = (float(down @ phases @ across) for down, across in self._whole)
         return red / max(blue, 1e-9) - 1.0
 
