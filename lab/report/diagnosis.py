@@ -98,7 +98,7 @@ def _law_chart(law: DiscoveredLaw) -> Figure:
         data.append(band(ends, none, np.full(2, float(np.median(half))), AFTER))
         points["marker"] = {"color": "@fg", "size": 2}
     else:
-        place = EMPIRICAL_PLACES.get((law.stage, law.along, law.of))  # type: ignore[call-overload]
+        place = EMPIRICAL_PLACES.get((law.stage, law.along, law.of))  # type: ignore[arg-type]
         if len(law.at) == len(departure):
             x, along = np.array(law.at), f"{law.along}, {place[2] if place else 'cycles per um'}"
         data.append(band(x.tolist(), departure, half, AFTER))
