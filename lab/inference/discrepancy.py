@@ -43,7 +43,7 @@ _ANGLES = 16
 #: The most nodes by time, at captures; at lit ones; of each channel's; and the correlation length, nodes.
 _MOST_TIMES, _MOST_LIT_TIMES, _FEW_TIMES, _TIMES_CORRELATED = 20, 64, 7, 8.0
 #: The most nodes by exposure.
-_MOST_EXPOSURES = 8
+_MOST_EXPOSURES = 16
 #: Codes after which a table of their widths repeats: the longest period of the combs that are counted.
 _CODES_PERIOD = 8
 #: Widths of the borders of a screen's cells at which their exponent varies, px.
