@@ -235,12 +235,11 @@ def with_reflections(camera: CameraModel, image: FloatArray, effects: Sequence[E
 def collected_mosaic(
     camera: CameraModel, electrons: FloatArray, effects: Sequence[Effect], *, exposure_s: float, elapsed_s: float
 ) -> FloatArray:
-    """Mean electrons (rows, cols) of light, in frames of any size, as pixels collect and share them; what packets leave
-    behind on their way to the output is that of the camera's middle."""
+    """Mean electrons (rows, cols) of light, in frames of any size, as pixels collect and share them, before they are
+    clocked out."""
     rows = light_of(camera, effects).row_factors(len(electrons), exposure_s, elapsed_s)
     charge = charge_of(camera, effects)
-    moved = charge.move_charge(charge.collect_light(electrons if rows is None else electrons * rows[:, None]))
-    return charge.trail_tile(moved)
+    return charge.move_charge(charge.collect_light(electrons if rows is None else electrons * rows[:, None]))
 
 
 def pair_gain_factor(camera: CameraModel, effects: Sequence[Effect]) -> float:

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import reduce
-from typing import Any, Protocol, Self
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ from sim.sensor.electrons import NEIGHBOURS, NO_MULTIPLICATION, Multiplication
 from sim.sensor.lines import LineGains, LineNoise
 from sim.sensor.particles import Particles
 from sim.sensor.reading_order import OrderedNoise
-from sim.sensor.trails import Trails
+from sim.sensor.trails import Trails, read_combs
 from sim.spectrum import FloatArray
 
 ComplexArray = NDArray[np.complex128]
@@ -513,17 +513,11 @@ class Charge(State):
         """Where the charge of a pixel at a place ends up by each of `trails`, (odd, odd)."""
         return [law.kernel(n) for law, n in zip(self.trails, self._transfers(place_um), strict=True)]
 
-    def trail_tile(self, electrons: FloatArray) -> FloatArray:
-        """Mean electrons (rows, cols) of a small part in the middle of even light, which goes on periodically, after
-        `trails` with as many transfers as in the frame's middle."""
-        tile = electrons
-        for law, transfers in zip(self.trails, self._transfers((0.0, 0.0)), strict=True):
-            frequency = np.asarray(np.fft.fftfreq(tile.shape[law.axis]), float)
-            along = law.otf(frequency, frequency, transfers)
-            shaped = along[:, None] if law.axis == 0 else along[None, :]
-            trailed = np.real(np.fft.ifft(np.fft.fft(tile, axis=law.axis) * shaped, axis=law.axis))
-            tile = law.steady_share(transfers) * trailed
-        return tile
+    def read_combs(self, axis: Literal[0, 1], step: int) -> FloatArray:
+        """Electrons (step, lines) that are read of the lines along an axis of the frame, given one electron in each
+        line of one phase of a mosaic of this period."""
+        lines = (self.camera.rows, self.camera.cols)[axis]
+        return read_combs(tuple(law for law in self.trails if law.axis == axis), lines, step)
 
     def multiplication(self, gain_db: float) -> Multiplication:
         """Random multiplication of each electron at a gain setting; of several in turn the factors multiply."""

@@ -11,7 +11,7 @@ from functools import cache, cached_property, partial, reduce
 import numpy as np
 from scipy.special import ndtri
 
-from sim.camera import CameraModel
+from sim.camera import CameraModel, Cfa
 from sim.detection import collection_m2_sr, detect_light
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
@@ -51,6 +51,8 @@ LEVEL = (
 
 #: Values that stand for the noise of a level: over all its points, and the most and the least at one point.
 NOISE_VALUES, MOST_AT_A_POINT, LEAST_AT_A_POINT = 480, 48, 6
+#: Share of the brightest channel to which `Uniform.light_of` is exact, and the most steps that it takes.
+LEAST_UNMIXED, MOST_UNMIXED = 1e-7, 40
 GOLDEN_RATIO = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
@@ -289,22 +291,80 @@ class Uniform:
         each = [self.mixing_factors({c: float(v[at]) for c, v in level.items()}) for at in np.ndindex(shape)]
         return {c: np.array([factors[c] for factors in each]).reshape(shape) for c in electrons}
 
-    def mixing_factors(self, electrons: Mapping[str, float]) -> dict[str, float]:
-        """Factor on each channel's mean by charge that moves between neighbouring pixels, from a small uniform mosaic
-        of these electrons; empty where none moves.
+    def mixing_factors(
+        self, electrons: Mapping[str, float], at_px: tuple[float, float] | None = None
+    ) -> dict[str, float]:
+        """Factor on each channel's mean by charge that moves between neighbouring pixels, in even light of these
+        electrons; empty where none moves. The mean is that of the frame, or that at the place `at_px` (row, column):
+        packets far from the output leave more behind.
         """
         if not self._charge.mixes:
             return {}
+        read = self._read_means(electrons, at_px)
+        return {c: read[c] / level if level > 0 else 1.0 for c, level in electrons.items()}
+
+    def _read_means(self, electrons: Mapping[str, float], at_px: tuple[float, float] | None = None) -> dict[str, float]:
+        """Mean electrons that are read by channel, of even light of these; arguments as of `mixing_factors`."""
+        down, across = (
+            _lines_at(comb, None if at_px is None else at_px[axis]) for axis, comb in enumerate(self.read_combs())
+        )
+        read = down @ self.phases_of(electrons) @ across.T
+        where = mosaic.phases(self.camera.cfa)
+        return {c: sum(float(read[at]) for at in where[c]) / len(where[c]) for c in electrons}
+
+    def phases_of(self, electrons: Mapping[str, float]) -> FloatArray:
+        """Electrons (step, step) of the mosaic's phases after neighbouring pixels have shared those of even light, by
+        channel, and before they are clocked out."""
+        if self.exchanges_charge:
+            return self._shared_phases(electrons)
+        parts = self._phases_of_one
+        return np.asarray(sum((e * parts[c] for c, e in electrons.items()), np.zeros(())))
+
+    @cached_property
+    def _phases_of_one(self) -> dict[str, FloatArray]:
+        """`phases_of` one electron in each channel, where what neighbours share is in proportion."""
+        channels = self.camera.channels
+        return {one: self._shared_phases({c: float(c == one) for c in channels}) for one in channels}
+
+    def _shared_phases(self, electrons: Mapping[str, float]) -> FloatArray:
         cfa, size, inner = self.camera.cfa, 12, slice(4, 8)
         tile = mosaic.assemble({c: np.full((size, size), level) for c, level in electrons.items()}, cfa)
-        after = self._charge.trail_tile(self._charge.move_charge(tile))
-        factors = {}
-        for channel, level in electrons.items():
-            where = np.zeros((size, size), bool)
-            for row, col in mosaic.phases(cfa)[channel]:
-                where[row :: mosaic.step(cfa), col :: mosaic.step(cfa)] = True
-            factors[channel] = float(after[inner, inner][where[inner, inner]].mean()) / level if level > 0 else 1.0
-        return factors
+        return phase_means(self._charge.move_charge(tile)[inner, inner], cfa)
+
+    def read_combs(self) -> tuple[FloatArray, FloatArray]:
+        """Electrons (step, rows) and (step, cols) that are read of the lines of each axis, given one electron in every
+        line of one phase of the mosaic: even light P (step, step) by phase is read as down' P across, (rows, cols)."""
+        step = mosaic.step(self.camera.cfa)
+        return self._charge.read_combs(0, step), self._charge.read_combs(1, step)
+
+    def light_of(self, read: Mapping[str, float]) -> dict[str, float]:
+        """Electrons of even light by channel of which these means are read: the inverse of `mixing_factors`.
+
+        Charge that unequal neighbours exchange isn't in proportion: the light is corrected until nothing changes."""
+        if not self._charge.mixes:
+            return dict(read)
+        channels = self.camera.channels
+        if not self.exchanges_charge:
+            return dict(zip(channels, (self._unmixing @ [read[c] for c in channels]).tolist(), strict=True))
+        light, least = dict(read), LEAST_UNMIXED * max(read.values(), default=0.0)
+        for _ in range(MOST_UNMIXED):
+            found = self._read_means(light)
+            light = {c: max(value + read[c] - found[c], 0.0) for c, value in light.items()}
+            if all(abs(read[c] - found[c]) <= least for c in light):
+                break
+        return light
+
+    @cached_property
+    def _unmixing(self) -> FloatArray:
+        """Matrix from the means that are read to the light, by channel."""
+        channels = self.camera.channels
+        one = [self._read_means({c: float(c == lit) for c in channels}) for lit in channels]
+        return np.linalg.inv(np.array([[read[c] for read in one] for c in channels]))
+
+    @property
+    def trails(self) -> bool:
+        """Return whether packets leave charge behind on their way to the output."""
+        return bool(self._charge.trails)
 
     def exchanged_e(self, squares: FloatArray) -> FloatArray:
         """Change (n,) of the middle pixels' electrons by charge that unequal neighbours exchange. `squares`: (n, k, k)
@@ -495,6 +555,23 @@ class Uniform:
                 dn = dn.mean(axis=-1) - camera.black_level_dn
             means[channel] = dn.mean(axis=-1)
         return means
+
+
+def phase_means(tile: FloatArray, cfa: Cfa) -> FloatArray:
+    """Means (step, step) of the phases of a mosaic's pixels, of a tile of whole periods."""
+    step = mosaic.step(cfa)
+    rows, cols = tile.shape
+    return np.asarray(tile.reshape(rows // step, step, cols // step, step).mean((0, 2)))
+
+
+def _lines_at(combs: FloatArray, at_px: float | None) -> FloatArray:
+    """Electrons (step, step) that the lines of each phase read of those of each phase: means over all lines, or over
+    the nearest ones of a place."""
+    step, lines = combs.shape
+    if at_px is None:
+        return np.array([combs[:, phase::step].mean(1) for phase in range(step)])
+    first = int(np.clip(round(at_px), 0, lines - step)) // step * step
+    return np.asarray(combs[:, first : first + step].T)
 
 
 def _of_each(law: Callable[[float], float], value: FloatArray | float) -> FloatArray:

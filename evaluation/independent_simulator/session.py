@@ -222,7 +222,7 @@ class _Recorder:
 
     def edges(self, plan: Plan) -> None:
         camera, light = self.camera, self.lamp()
-        half = min(100, camera.rows // 2 - 4)
+        half = min(100, min(camera.rows, camera.cols) // 2 - 4)
         region = [camera.rows // 2 - half, camera.cols // 2 - half, camera.rows // 2 + half, camera.cols // 2 + half]
         lights = [light]
         if plan.lights:

@@ -106,10 +106,15 @@ class Coordinate:
 class Alternative:
     """Signatures of a hypothesis for one value of its shapes and choices: instances whose changes of the prediction
     may be combined with coefficients >= 0, and the prior scale of each coefficient. Where two instances are of opposite
-    sign of one parameter, each has half of the prior."""
+    sign of one parameter, each has half of the prior.
+
+    `is_whole`: one instance without a size, which acts as a whole or not at all: its coefficient is 1. `log_share`: log
+    of the alternative's prior probability over that of one of equally probable alternatives."""
 
     points: tuple[Point, ...]
     scales: tuple[float, ...]
+    is_whole: bool = False
+    log_share: float = 0.0
 
 
 @dataclass(frozen=True)

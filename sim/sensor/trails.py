@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -51,18 +52,6 @@ class Trails:
     def transfers(self, line: FloatArray, lines: int) -> FloatArray:
         """Return the number of transfers of lines 0 .. lines - 1, which may lie between two."""
         return np.asarray(line + 1.0 if self.output == "first" else lines - line)
-
-    def steady_share(self, transfers: float) -> float:
-        """Share of even light that is read, far from the first lines: a packet finds what it loses, but for what
-        lies in the trail of the transfers that are still to come, the loss times the mean delay."""
-        lost = 0.0
-        for share, release in self.releases:
-            held = np.exp(-1.0 / release)
-            more = self.loss * share
-            if self.at_once:
-                more /= (1.0 + transfers * self.loss * share / held) ** 2
-            lost += more / (1.0 - held)
-        return 1.0 - lost
 
     def _retain_at_once(self, transfers: FloatArray | float) -> list[tuple[FloatArray, float]]:
         """Return the share of a packet that each species keeps of it, and b, where all transfers act at once."""
@@ -164,6 +153,17 @@ class Trails:
         if self.output == "last":
             kernel = kernel[::-1]
         return np.asarray(kernel[:, None] if self.axis == 0 else kernel[None, :])
+
+
+@lru_cache(maxsize=256)
+def read_combs(laws: tuple[Trails, ...], lines: int, step: int) -> FloatArray:
+    """Electrons (step, lines) that are read of every line, of one electron in every `step`-th line from the first, the
+    second, ... one on alone: even light of a mosaic, by its phases. `laws`: of one axis, one after the other."""
+    combs = (np.arange(lines) % step == np.arange(step)[:, None]).astype(float)
+    for law in laws:
+        combs = replace(law, axis=1).clock(combs)
+    combs.setflags(write=False)
+    return combs
 
 
 def _release(packets: FloatArray, held: float) -> FloatArray:

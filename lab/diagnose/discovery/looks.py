@@ -14,7 +14,8 @@ from scipy.signal import savgol_coeffs
 from lab.diagnose.discovery.images import DarkImages, Image, dark_images, flat_images, noise_by_time
 from lab.diagnose.discovery.profile import Look, Profile
 from lab.errors import NotDetermined
-from lab.observables.codes.density import CodeHistogram, counted, counted_in_all, prepared, widths
+from lab.observables.codes.density import CodeHistogram, counted, counted_in_all, prepared
+from lab.observables.codes.landings import widths
 from lab.observables.darks.frames import cell_means
 from lab.observables.darks.readout import dark_readout
 from lab.observables.dataset import Dataset

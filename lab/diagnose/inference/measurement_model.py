@@ -192,14 +192,14 @@ class MeasurementModel:
         return found
 
     @cached_property
-    def _single_block_nuisances(self) -> frozenset[str]:
+    def single_block_nuisances(self) -> frozenset[str]:
         """Nuisance parameters of one block alone, which belong to the covariance of that block."""
         count = Counter(name for i in range(len(self.blocks)) for name in self._prediction(i, []).jacobian)
         return frozenset(name for name, blocks in count.items() if blocks == 1)
 
     def _shared_jacobian(self, effects: Effects) -> FloatArray:
         """Return the Jacobian by nuisance parameters of several blocks, (n, k)."""
-        columns = list(self.nuisance_jacobian(effects, self._single_block_nuisances).values())
+        columns = list(self.nuisance_jacobian(effects, self.single_block_nuisances).values())
         return np.column_stack(columns) if columns else np.zeros((len(self.value), 0))
 
     # --- distributions -----------------------------------------------------------------------------------------------
@@ -259,7 +259,7 @@ class MeasurementModel:
             block, both = self.blocks[index], np.ix_(only, only)
             covariance = block.covariance[both].copy()
             prediction = self._prediction(index, here)
-            own = [c[only] for name, c in prediction.jacobian.items() if name in self._single_block_nuisances]
+            own = [c[only] for name, c in prediction.jacobian.items() if name in self.single_block_nuisances]
             if own:
                 covariance += np.transpose(own) @ np.array(own)
             for i, one in enumerate(here):

@@ -6,26 +6,24 @@ it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy import ndimage, sparse
+from scipy import sparse
 from scipy.linalg import block_diag
-from scipy.special import ndtr
 
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
+from lab.observables.codes.even_light import ExpectedCounts, LevelCounts, levels_of
+from lab.observables.codes.landings import landings
 from lab.observables.dataset import Dataset, held_out_flats, held_out_of
-from lab.observables.noise.surface import shading
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.uniform import Uniform
 
 #: Step of the codes, DN, from which on they were shifted or scaled: one stuck bit gives 2, two stuck bits are taken
 #: as a shift.
@@ -44,18 +42,7 @@ COMB_FLOOR = 3e-4
 VARIANCE_FLOOR = 0.03  # of a chi2's number of codes
 #: Frequencies of the combs, cycles a code.
 COMBS = (1 / 2, 3 / 8, 1 / 4, 1 / 8)
-AROUND = 9  # side of the box in a plane of the mosaic whose mean is the light at a pixel, px
-#: Width of the levels whose pixels share one normal distribution, over the standard deviation of the noise.
-STEP_OF_LEVELS = 0.2
-#: Levels over which the noise of local means scatters neighbouring pixels: six standard deviations, of 1 / `AROUND` of
-#: the pixels' noise each.
-LEVELS_TOGETHER = round(6.0 / AROUND / STEP_OF_LEVELS) + 1
 PARTS = 4  # of the range of codes, each with a chi2 of its own
-FINE = 8  # samples a code at which the converter's law is evaluated where it isn't straight
-#: Codes by which the middle of 1 / `FINE` of a code may land off the mean of its ends, where the law is straight.
-JUMP = 1e-3
-STRAIGHT = 1e-9  # codes: second difference of a law between codes, of rounding alone
-MARGIN = 64  # codes beyond those that are counted
 
 
 @dataclass(frozen=True)
@@ -77,7 +64,7 @@ def measure_code_density(dataset: Dataset) -> Observable:
     counts = dataset.once(counted)
     labels: list[Label] = []
     places: list[tuple[float, float]] = []
-    sets: dict[bool, tuple[CodeHistogram, FloatArray, list[_Part]]] = {}
+    sets: dict[bool, tuple[CodeHistogram, FloatArray, ExpectedCounts, list[_Part]]] = {}
     values, covariances, scales = [], [], []
     for held_out in (False, True):
         codes = prepared(dataset, counts[held_out])
@@ -95,9 +82,9 @@ def measure_code_density(dataset: Dataset) -> Observable:
         scales += [np.ones(len(steps) + len(combs)), np.array([p.ofwidths for p in parts])]
         linear = np.vstack([steps, combs])
         floor = np.concatenate([np.zeros(len(steps)), np.full(len(combs), COMB_FLOOR)])
-        covariance, operator = _propagated(linear, codes, counts[held_out])
+        light = ExpectedCounts.of(counts[held_out].planes, codes.first, len(codes.count))
         covariances += [
-            covariance + np.diag(np.square(floor)),
+            _covariance(linear, codes, counts[held_out], light) + np.diag(np.square(floor)),
             np.diag([1.0 + (VARIANCE_FLOOR * p.number / p.chi2_std) ** 2 for p in parts]),
         ]
         members = tuple(counts[held_out].captures)
@@ -113,7 +100,7 @@ def measure_code_density(dataset: Dataset) -> Observable:
         places += [(float(codes.first + b), 0.0) for b in boundaries]
         places += [(0.0, far * k) for k in range(len(names))]
         places += [(label.x, 0.0) for label in labels[len(places) :]]
-        sets[held_out] = codes, operator, parts
+        sets[held_out] = codes, linear, light, parts
     if not labels:
         raise NotDetermined(
             "code_density", f"no even light over {LEAST_CODES} codes and more whose noise exceeds {LEAST_NOISE:g} codes"
@@ -122,12 +109,12 @@ def measure_code_density(dataset: Dataset) -> Observable:
     def predict(effects: Effects) -> Prediction:
         found: list[FloatArray] = []
         scatter: dict[str, tuple[int, float]] = {}
-        for held_out, (codes, operator, parts) in sets.items():
-            wider = widths(codes, effects, dataset) - 1.0
-            moved = codes.rough @ (codes.expected * wider)
+        for held_out, (codes, linear, light, parts) in sets.items():
+            change = light.change(landings(codes.first, len(codes.count), effects, dataset))
+            moved = codes.rough @ change
             excess = np.array([p.excess(moved) for p in parts])
-            at = sum(map(len, found)) + len(operator)
-            found += [operator @ wider, excess]
+            at = sum(map(len, found)) + len(linear)
+            found += [linear @ change, excess]
             for k in np.flatnonzero(excess > 0.0):
                 scatter[f"codes:{held_out}:{k}"] = at + int(k), parts[k].scatter(float(excess[k]))
         mean = np.concatenate(found)
@@ -141,15 +128,6 @@ def measure_code_density(dataset: Dataset) -> Observable:
     )  # fmt: skip
 
 
-class _LevelCounts(NamedTuple):
-    """The pixels of one level in one plane: their first code, their number, and by code (3, codes) the probability and
-    its covariances with the first two Hermite polynomials, z and (z^2 - 1) / sqrt 2, of the normalised departure z."""
-
-    first: int
-    number: int
-    table: FloatArray
-
-
 @dataclass(frozen=True)
 class _Counts:
     """Counts of every code in some frames, (white level + 1,), and the counts that light and noise give an ideal
@@ -158,58 +136,19 @@ class _Counts:
     count: FloatArray
     expected: FloatArray
     captures: list[str]
-    planes: list[list[_LevelCounts]]
+    planes: list[list[LevelCounts]]
 
     def take(self, dataset: Dataset, capture: Any) -> None:
         """Add a capture's frame."""
         frame = dataset.recordings.frame(capture)
         self.count[:] += np.bincount(frame.ravel(), minlength=len(self.count))[: len(self.count)]
         for plane in mosaic.planes(frame, dataset.camera.cfa).values():
-            levels = list(_levels(np.asarray(plane, np.float32), dataset))
+            levels = list(levels_of(np.asarray(plane, np.float32), dataset))
             for first, number, table in levels:
                 last = min(first + table.shape[1], len(self.expected))
                 self.expected[first:last] += number * table[0, : last - first]
             self.planes.append(levels)
         self.captures.append(capture.id)
-
-
-def _levels(plane: Any, dataset: Dataset) -> Iterator[_LevelCounts]:
-    """Yield a plane's pixels by level.
-
-    A pixel's expected code is the local mean over `AROUND` x `AROUND` pixels, and as much beside it as its row is on
-    the whole. The smooth surface is taken off first, as means at a frame's border would be wrong by its slope. The
-    variance is proportional to the signal above black, and scaled so that its mean is the measured mean square of the
-    departures: so much are the codes spread about local means, which have noise of their own. The distribution is
-    normal with the skewness of Poisson numbers (Edgeworth's first term).
-    """
-    bend = shading(plane)
-    surface = bend + ndimage.uniform_filter(plane - bend, AROUND, mode="reflect")
-    surface = surface + (plane - surface).mean(axis=1, keepdims=True)
-    noise = dataset.noise
-    signal = max(float(surface.mean()) - noise.black, 1.0)
-    variance = float(np.mean(np.square(plane - surface), dtype=float))
-    # where no gain is known, that of shot noise alone
-    gain = noise.gain if noise.gain_is_known else variance / signal
-    # pixels are binned by level, in steps narrow beside the noise; the variance of the levels within a bin is added
-    step = max(STEP_OF_LEVELS * np.sqrt(variance), 1.0)
-    above = surface.ravel().astype(float) - float(surface.min())
-    group = (above / step).astype(int)
-    number = np.bincount(group)
-    share = np.maximum(number, 1)
-    mean = np.bincount(group, above) / share
-    within = np.maximum(np.bincount(group, np.square(above)) / share - np.square(mean), 0.0)
-    for n, middle, added in zip(number, mean + float(surface.min()), within, strict=True):
-        if n == 0:
-            continue
-        own = max(middle - noise.black, 1.0)
-        sigma = np.sqrt(max(variance * own / signal + added, 1e-2))
-        low = max(int(middle - 6.0 * sigma), 0)
-        edges = (np.arange(low, int(middle + 6.0 * sigma) + 3) - 0.5 - middle) / sigma
-        density = np.exp(-0.5 * np.square(edges)) / np.sqrt(2.0 * np.pi)
-        # Poisson numbers s in units of the gain K have the third central moment K^2 (K s)
-        skewness = gain**2 * own / sigma**3
-        whole = ndtr(edges) - skewness / 6.0 * (np.square(edges) - 1.0) * density
-        yield _LevelCounts(low, int(n), np.diff(np.array([whole, -density, -edges * density / np.sqrt(2.0)])))
 
 
 def counted(dataset: Dataset) -> dict[bool, _Counts]:
@@ -294,44 +233,28 @@ def _smoothing(half: int) -> FloatArray:
     return np.asarray(np.linalg.pinv(np.vander(x, DEGREE + 1, increasing=True))[0])
 
 
-def _propagated(linear: FloatArray, codes: CodeHistogram, counts: _Counts) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance (m, m) of `linear` (m, codes) @ counts, and the operator (m, codes) that takes codes'
-    widths less 1 to their expected change.
+def _covariance(linear: FloatArray, codes: CodeHistogram, counts: _Counts, light: ExpectedCounts) -> FloatArray:
+    """Return the covariance (m, m) of `linear` (m, codes) @ counts less what is expected.
 
-    Each pixel has one code: the counts of a level's pixels are multinomial. What is expected has local means and each
-    plane's mean square from these pixels, so that it follows some of what codes of unequal width do to the counts: of
-    neighbouring levels the part along z, of a plane the part along z^2 - 1. The same part of the counts' noise stays in
-    the covariance: without it, directions remain of which the operator's second order, the step over the noise's
-    standard deviation, would be the error. It makes chi2 0.7 of the number of places."""
-    expected = np.maximum(codes.expected, 1.0)
-    covariance, operator = (linear * expected) @ linear.T, linear * codes.expected
-    taken = []
-    for levels in counts.planes:
-        followed = [(levels[k : k + LEVELS_TOGETHER], 1) for k in range(0, len(levels), LEVELS_TOGETHER)]
-        for members, row in (*(([level], 0) for level in levels), *followed, (levels, 2)):
-            first, direction = _direction(members, row, codes)
-            at = slice(first, first + len(direction))
-            part = linear[:, at] @ direction
-            if row == 0:
-                taken.append(part)
-            else:
-                operator[:, at] -= np.outer(part, direction)
-    table = np.array(taken).T
-    return covariance - table @ table.T, operator
+    Each pixel has one code: the counts of a level's pixels are multinomial. What is expected has its local means and
+    each plane's mean square from the same pixels: it follows the counts of neighbouring levels along z, and those of a
+    plane along z^2 - 1. Both parts of the counts' noise cancel."""
+    covariance = (linear * np.maximum(codes.expected, 1.0)) @ linear.T
+    taken = [
+        linear[:, first : first + len(direction)] @ direction
+        for levels in counts.planes
+        for first, direction in (_scatter_of(level, codes) for level in levels)
+    ]
+    table = np.concatenate([np.array(taken).T, *(linear @ light.followed(row) for row in (1, 2))], axis=1)
+    return covariance - table @ table.T
 
 
-def _direction(levels: Sequence[_LevelCounts], row: int, codes: CodeHistogram) -> tuple[int, FloatArray]:
-    """Return the sum of one row of the levels' tables, by the pixels of each, over the root of their number: the index
-    of its first code in `codes`, and the values."""
-    end = codes.first + len(codes.count)
-    begin = min(max(min(level.first for level in levels), codes.first), end)
-    last = max(min(max(level.first + level.table.shape[1] for level in levels), end), begin)
-    total = np.zeros(last - begin)
-    for first, number, table in levels:
-        low, high = max(first, begin), min(first + table.shape[1], last)
-        if low < high:
-            total[low - begin : high - begin] += number * table[row, low - first : high - first]
-    return begin - codes.first, total / np.sqrt(sum(level.number for level in levels))
+def _scatter_of(level: LevelCounts, codes: CodeHistogram) -> tuple[int, FloatArray]:
+    """Return a level's probabilities times the root of its pixels' number: the index of the first code in `codes`, and
+    the values."""
+    low = max(level.first, codes.first)
+    high = max(min(level.first + level.table.shape[1], codes.first + len(codes.count)), low)
+    return low - codes.first, np.sqrt(level.number) * level.table[0, low - level.first : high - level.first]
 
 
 def _combs(codes: CodeHistogram) -> tuple[FloatArray, list[tuple[float, str]]]:
@@ -430,49 +353,6 @@ def _parts(codes: CodeHistogram) -> list[_Part]:
         chi2_std = float(np.sqrt(2.0 * number * np.sum(shared**2)))
         ofwidths = float(np.sum(unequal[at][kept] / variance[at][kept])) / chi2_std
         found.append(_Part(at, number, np.where(kept, variance[at], np.inf), chi2_std, ofwidths))
-    return found
-
-
-def widths(codes: CodeHistogram, effects: Effects, dataset: Dataset) -> FloatArray:
-    """Width (codes,) of each code: the interval of the converter's input that gives it, 1 for an ideal converter.
-
-    The input is cut at the edges of the ideal converter's codes. Where the converter's law is straight over several of
-    these intervals, what lands on each code is exact; other intervals are sampled `FINE` times, and samples in which it
-    bends as often again.
-    """
-    size, law = len(codes.count), Uniform(dataset.camera, effects).codes
-    edge = np.asarray(np.arange(size + 2 * MARGIN + 1) - 0.5 - MARGIN, float)  # from the first counted code on
-    lands = law(edge + codes.first) - codes.first
-    bend = np.abs(np.diff(lands, 2)) > STRAIGHT
-    bent = np.zeros(len(edge) - 1, bool)
-    bent[:-1] |= bend
-    bent[1:] |= bend
-    found = np.zeros(size)
-    begin, step = edge[:-1][bent], 1.0
-    for is_last in (False, True):
-        # a sample is an interval of `step` codes, which the law stretches and two codes may share
-        step /= FINE
-        begin = (begin[:, None] + step * np.arange(FINE)).ravel()
-        one, other, middle = (law(begin + share * step + codes.first) - codes.first for share in (0.0, 1.0, 0.5))
-        low, high = np.minimum(one, other), np.maximum(one, other)
-        bends = np.abs(middle - 0.5 * (low + high)) > JUMP * (FINE * step)
-        if is_last:  # it lands where its middle lands, as wide as without the law
-            low[bends], high[bends] = middle[bends] - 0.5 * step, middle[bends] + 0.5 * step
-        else:  # is looked at more finely
-            low, high, begin = low[~bends], high[~bends], begin[bends]
-        code = np.rint(high).astype(int)
-        stretch = high - low
-        above = np.where(stretch > 0.0, np.clip((high - code + 0.5) / np.maximum(stretch, 1e-12), 0.0, 1.0), 1.0)
-        for at, share in ((code, above), (code - 1, 1.0 - above)):
-            inside = (at >= 0) & (at < size)
-            found += np.bincount(at[inside], share[inside], minlength=size) * step
-    turns = np.flatnonzero(np.diff(np.r_[True, bent, True]))
-    for begin, end in zip(turns[::2], turns[1::2], strict=True):
-        low, high = lands[begin], lands[end]
-        first, last = (int(np.clip(np.rint(y), 0, size - 1)) for y in (low, high))
-        cuts = np.clip(np.arange(first, last + 2) - 0.5, low, high)
-        cuts[0], cuts[-1] = max(cuts[0], -0.5), min(cuts[-1], size - 0.5)
-        found[first : last + 1] += np.maximum(np.diff(cuts), 0.0) * (end - begin) / (high - low)
     return found
 
 

@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from lab.errors import NotDetermined
-from lab.observables.darks.frames import CELL_FLOOR_DN, CELLS, cell_means, dark_frames
+from lab.observables.codes.rounding import rounding_std_dn
+from lab.observables.darks.frames import CELLS, cell_means, dark_frames, rounding_waves_of_change_dn, spread_dn2
 from lab.observables.darks.level import dark_current_map
 from lab.observables.dataset import Dataset
 from lab.observables.observable import Label, Measurement, Observable, Prediction
@@ -56,11 +57,10 @@ def measure_dark_field(dataset: Dataset) -> Observable:
     pattern = np.eye(count) * float(np.max(fixed))
     pattern += (row[:, None] == row) * line_dn2["rows"] * rows / dataset.camera.rows
     pattern += (col[:, None] == col) * line_dn2["columns"] * cols / dataset.camera.cols
-    covariance = np.kron(np.ones((len(points), len(points))), pattern) + np.diag(
-        np.repeat(changing, count) + (CELL_FLOOR_DN * dataset.step_dn) ** 2
-    )
+    covariance = np.kron(np.ones((len(points), len(points))), pattern) + np.diag(np.repeat(changing, count))
     exposures = np.array([f.condition.exposure_s for f, *_ in points])
     half = 0.5 * np.hypot(rows, cols)
+    rounding = rounding_std_dn(spread_dn2([f for f, *_ in points], dataset.step_dn), dataset.step_dn)
     radius = np.hypot(row - (rows - 1) / 2, col - (cols - 1) / 2) / half
 
     def predict(effects: Effects) -> Prediction:
@@ -76,10 +76,14 @@ def measure_dark_field(dataset: Dataset) -> Observable:
                 here = dataset.noise.gain * f.condition.exposure_s * (cells - cells.mean())
                 mean[i * count : (i + 1) * count] += here.ravel()
         jacobian = {}
-        for i in range(len(points)):
-            column = np.zeros(len(value))
-            column[i * count : (i + 1) * count] = 1.0
-            jacobian[f"dark_field:{i}"] = column
+        for i, std_dn in enumerate(rounding):
+            own = slice(i * count, (i + 1) * count)
+            for number, wave in enumerate(
+                (np.ones(count), *rounding_waves_of_change_dn(mean[own], std_dn, dataset.step_dn))
+            ):
+                column = np.zeros(len(value))
+                column[own] = wave
+                jacobian[f"dark_field:{i}:rounding {number}" if number else f"dark_field:{i}"] = column
         for number, shape in enumerate(_slow_rows(dataset, model)):
             for i, (*_, part) in enumerate(points):
                 column = np.zeros(len(value))

@@ -15,6 +15,7 @@ from scipy import ndimage
 
 from lab.capture_kinds.dark import DarkCapture
 from lab.errors import NotDetermined
+from lab.observables.codes.rounding import LEAST_ROUNDING_DN, QUANTISATION_DN2
 from lab.observables.dataset import Dataset, held_out_of
 from lab.observables.noise.line_spectra import periodogram, pooled, pooled_along
 from lab.observables.noise.robust import (
@@ -34,7 +35,6 @@ from sim.spectrum import FloatArray
 TEMPERATURE_STEP_C = 1.0  # dark frames whose temperatures differ by no more are repeats
 CELLS = 4, 6  # of a frame: rows, columns
 LEAST_CELL_PX = 2  # least side of a cell
-CELL_FLOOR_DN = 0.005  # standard deviation of a cell's mean beside noise
 MOST_CONDITIONS = 3  # conditions whose fixed pattern is measured: the shortest, the longest, the warmest
 #: Lower edges of the bins in which outlying pixels are counted, in standard deviations of a pixel's fixed pattern. The
 #: first two count dark pixels as well, below their negatives.
@@ -360,6 +360,34 @@ def too_coarse(frames: Sequence[DarkStatistics], limit_dn: float) -> str:
         f"the temporal noise of dark frames is {noise:.2f} DN, below the limit of {limit_dn:g} DN: codes are too "
         "coarse to show how it is distributed; a higher gain would"
     )
+
+
+def spread_dn2(frames: Sequence[DarkStatistics], step_dn: float) -> FloatArray:
+    """Return the variance (conditions,) of pixels about their frame's mean before rounding to `step_dn`, by temporal
+    noise and fixed pattern, DN^2. The pattern is the smallest one of the conditions."""
+    patterns = [
+        max(part.white_dn2 - f.changing[out].white_dn2 / part.frames, 0.0)
+        for f in frames
+        for out, part in f.fixed.items()
+        if out in f.changing
+    ]
+    pattern, found = min(patterns, default=0.0), []
+    for f in frames:
+        moving = next((c.variance_dn2 for c in f.changing.values()), None)
+        single = min((part.white_dn2 for part in f.fixed.values()), default=0.0)  # one frame has both
+        found.append(single if moving is None else moving + pattern)
+    return np.maximum(np.array(found) - QUANTISATION_DN2 * step_dn**2, 0.0)
+
+
+def rounding_waves_of_change_dn(change_dn: FloatArray, std_dn: float, step_dn: float) -> list[FloatArray]:
+    """Return the errors by rounding, one standard deviation each, of differences that a change (n,) of means makes, DN:
+    none where rounding is dithered.
+
+    `std_dn`: of the error of a mean, a wave of one step of unknown phase. Equal means have equal errors.
+    """
+    turn = 2.0 * np.pi * change_dn / step_dn
+    waves = [std_dn * np.sin(turn), std_dn * (np.cos(turn) - 1.0)]
+    return [wave for wave in waves if np.abs(wave).max(initial=0.0) > LEAST_ROUNDING_DN * step_dn]
 
 
 def captures_of(frames: DarkStatistics, held_out: bool) -> tuple[str, ...]:

@@ -10,8 +10,8 @@ import numpy as np
 
 from lab.capture_kinds.base import Capture
 from lab.errors import NotDetermined
-from lab.observables.codes.rounding import QUANTISATION_DN2
-from lab.observables.darks.frames import DarkStatistics, conditions, dark_frames
+from lab.observables.codes.rounding import rounding_waves_dn
+from lab.observables.darks.frames import conditions, dark_frames, spread_dn2
 from lab.observables.dataset import Dataset
 from lab.observables.noise.figures import STATED_BLACK_DN, STATED_BLACK_SHARE
 from lab.observables.noise.line_means import LineMeans
@@ -85,13 +85,13 @@ def measure_dark(dataset: Dataset) -> Observable:
         return Prediction(mean, dataset.free_offsets(exposures) | lines.jacobian(effects))
 
     # noise of less than about half a code doesn't dither: rounding moves the mean, by its place between two codes
-    coarse = np.array([_rounding_dn(f, noise.step_dn) for f in frames for _ in f.condition.captures])
+    spread = np.repeat(spread_dn2(frames, noise.step_dn), [len(f.condition.captures) for f in frames])
+    waves = np.reshape(rounding_waves_dn(base, spread, noise.step_dn), (-1, len(value)))
     # where no frame is repeated, by the read noise that is taken elsewhere
     pixels = dataset.camera.rows * dataset.camera.cols
     usual_dn2 = (noise.read_dn**2 + noise.gain * noise.dark_dn_per_s * exposures) / pixels
     own_dn2 = np.array([f.mean_dn2[c.id] for f in frames for c in f.condition.captures])
     own_dn2 = np.where(np.isfinite(own_dn2), own_dn2, usual_dn2)
-    same = np.array([[a[1] is b[1] for b in captures] for a in captures])
     # the coordinate of smoothness: 10 degrees count as twice the range of exposures
     reach = float(max(np.ptp(exposures), 1e-3))
     warmer = np.array(
@@ -102,22 +102,12 @@ def measure_dark(dataset: Dataset) -> Observable:
     )
     return Observable(
         measurement=DARK, reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
-        covariance=np.diag(own_dn2 + noise.white_jitter_dn**2) + same * np.outer(coarse, coarse),
+        covariance=np.diag(own_dn2 + noise.white_jitter_dn**2) + waves.T @ waves,
         labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
         reads=LAG | DARK_CURRENT | {"signal.offset_dn", "signal.exposure_offset_dn", "codes.codes"},
         scattered_by=LINES, predict=predict,
         scale=np.ones(len(value)),
     )  # fmt: skip
-
-
-def _rounding_dn(frames: DarkStatistics, step_dn: float) -> float:
-    """Largest shift of a mean by rounding to `step_dn`, DN: exp(-2 pi^2 variance) / pi of the step, with the variance
-    before rounding in its squares."""
-    changing = next((c.variance_dn2 for c in frames.changing.values()), None)
-    if changing is None:
-        return 0.1 * step_dn
-    bare = max(changing / step_dn**2 - QUANTISATION_DN2, 0.0)
-    return float(step_dn * np.exp(-2.0 * np.pi**2 * bare) / np.pi)
 
 
 def measure_black_level(dataset: Dataset) -> Observable:

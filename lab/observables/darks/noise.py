@@ -25,7 +25,6 @@ from sim.sensor.reading_order import OrderedNoise
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
-VARIANCE_FLOOR = 0.004  # relative standard deviation of a temporal variance beside chance
 CARRIED_STD = 0.3  # relative prior standard deviation of what frames before leave: the mean level measures it
 LEAST_NOISE_DN = 0.4  # of codes of a step of 1 DN; below, codes are too coarse to measure temporal noise
 
@@ -58,9 +57,7 @@ def measure_dark_noise(dataset: Dataset) -> Observable:
     step_dn2 = noise.step_dn**2
     bare = np.maximum(value - noise.quantisation_dn2, 0.0) / step_dn2
     coarse = step_dn2 * (4.0 * bare + 0.1) * np.exp(-2.0 * np.pi**2 * bare)
-    covariance = np.diag(
-        2.0 * value**2 / (size * count) + 2.0 * lines / count + (VARIANCE_FLOOR * value) ** 2 + coarse**2
-    )
+    covariance = np.diag(2.0 * value**2 / (size * count) + 2.0 * lines / count + coarse**2)
     dark = noise.gain * noise.dark_dn_per_s * exposures
     shortest = float(value[int(np.argmin(exposures))])
     base = shortest + dark - float(dark.min())

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from lab.errors import NotDetermined
+from lab.observables.codes.rounding import rounding_std_dn
 from lab.observables.darks.frames import (
-    CELL_FLOOR_DN,
     DarkCondition,
     DarkNoise,
     DarkPattern,
@@ -23,6 +23,8 @@ from lab.observables.darks.frames import (
     conditions,
     dark_frames,
     fine_conditions,
+    rounding_waves_of_change_dn,
+    spread_dn2,
 )
 from lab.observables.dataset import Dataset
 from lab.observables.noise.line_spectra import LEVEL_BAND, Bands, log_mean_bias, log_mean_variance
@@ -41,7 +43,6 @@ from sim.uniform import Uniform
 
 
 BANDS = 6  # of a spectrum across lines
-POWER_FLOOR = 0.02  # relative standard deviation of a band's power: a healthy read-out isn't exactly white
 LEAST_FREQUENCIES = 2  # below the level band: `Bands` makes no band of fewer
 LEAST_LINE_DN = 0.3  # of codes of a step of 1 DN: temporal noise of a pixel below which codes are too coarse
 
@@ -66,7 +67,7 @@ def measure_temporal_lines(lines: Lines, dataset: Dataset) -> Observable:
         power = np.average([c.lines[lines][1] for c in part], axis=0, weights=weight)
         modes, level = bands.modes * weight.sum(), sum(c.lines[lines][2] for c in part)
         value.append(np.log(bands.mean(power)) - log_mean_bias(modes) - log_mean_bias(level))
-        variance.append(log_mean_variance(modes) + 1.0 / level + POWER_FLOOR**2)
+        variance.append(log_mean_variance(modes) + 1.0 / level)
         inverse.append(np.full(len(modes), float(np.average([1.0 / c.white_dn2 for c in part], weights=weight))))
         ids = tuple(i for f in fine if out in f.changing for i in captures_of(f, out))
         labels += [Label(float(x), "all", "temporal", ids, out) for x in bands.middle]
@@ -154,13 +155,12 @@ def measure_fixed_lines(lines: Lines, dataset: Dataset) -> Observable:
     pieces = len(first.fixed)
     one = np.diag(log_mean_variance(bands.modes))
     correlation = np.array([[1.0 if a == b else share[a] * share[b] for b in first.fixed] for a in first.fixed])
-    covariance = np.kron(correlation, one) + np.eye(pieces * len(one)) * (POWER_FLOOR**2 + 0.01**2)
+    covariance = np.kron(correlation, one)
     parity = np.array([part.parity_dn[lines] for part in first.fixed.values()])
     scatter = np.array([4.0 * _line_dn2(part, lines, length) * length / size for part in first.fixed.values()])
+    rounding = float(rounding_std_dn(spread_dn2([first], dataset.step_dn), dataset.step_dn)[0])
     # powers are squares: lines themselves have the root of the powers' correlation
-    parity_cov = (
-        np.sqrt(np.outer(scatter, scatter) * correlation) + np.eye(pieces) * (CELL_FLOOR_DN * dataset.step_dn) ** 2
-    )
+    parity_cov = np.sqrt(np.outer(scatter, scatter) * correlation)
     n = len(covariance)
     whole = np.zeros((n + pieces, n + pieces))
     whole[:n, :n], whole[n:, n:] = covariance, parity_cov
@@ -183,13 +183,13 @@ def measure_fixed_lines(lines: Lines, dataset: Dataset) -> Observable:
         moving += _ordered_power(dataset, model, lines, frequency) / length
         parts = zip(factor, first.fixed.values(), strict=True)
         power = np.concatenate([np.log1p(f * bands.mean(still + moving / part.frames)) for f, part in parts])
-        apart = 4.0 / size * sum((_alternating_e2(dataset, one, lines) for one in model.reading_order), 0.0)
-        jacobian = {}
-        for k, part in enumerate(first.fixed.values() if apart > 0.0 else ()):
-            column = np.zeros(n + pieces)
-            column[n + k] = dataset.noise.gain * np.sqrt(apart / part.frames)
-            jacobian[f"dark_{name}:odd:{k}"] = column
-        return Prediction(np.concatenate([power, np.full(pieces, dataset.noise.gain * odd)]), jacobian)
+        odd_dn = np.full(pieces, dataset.noise.gain * odd)
+        waves = [
+            *_alternating_dn(dataset, model, lines, first),
+            *rounding_waves_of_change_dn(odd_dn, rounding, dataset.step_dn),
+        ]
+        jacobian = {f"dark_{name}:odd:{k}": np.concatenate([np.zeros(n), wave]) for k, wave in enumerate(waves)}
+        return Prediction(np.concatenate([power, odd_dn]), jacobian)
 
     return Observable(
         measurement=ROW_PATTERN if lines == "rows" else COLUMN_PATTERN, reach=0.1,
@@ -197,6 +197,15 @@ def measure_fixed_lines(lines: Lines, dataset: Dataset) -> Observable:
         reads=LINES | ADDED, predict=predict,
         scale=np.concatenate([np.ones(n), 10.0 * std]),
     )  # fmt: skip
+
+
+def _alternating_dn(dataset: Dataset, model: Uniform, lines: Lines, frames: DarkStatistics) -> list[FloatArray]:
+    """Return the scatter (parts,) of mean frames' differences of odd and even lines by noise in reading order, one
+    standard deviation each, DN."""
+    size = dataset.camera.rows * dataset.camera.cols
+    apart = 4.0 / size * sum((_alternating_e2(dataset, one, lines) for one in model.reading_order), 0.0)
+    scatter = [dataset.noise.gain * float(np.sqrt(apart / part.frames)) for part in frames.fixed.values()]
+    return list(np.diag(scatter)) if apart > 0.0 else []
 
 
 def _line_dn2(part: DarkPattern | DarkNoise, lines: Lines, length: int) -> float:
@@ -240,7 +249,7 @@ def measure_dark_correlation(dataset: Dataset) -> Observable:
             bands = Bands.of(frequency, 3)
             total = np.array([modes[a:b].sum() for a, b in zip(bands.first, bands.last, strict=True)])
             value.append(np.log(bands.mean(power)) - log_mean_bias(total) - log_mean_bias(level))
-            variance.append(1.0 / total + 1.0 / level + POWER_FLOOR**2)
+            variance.append(1.0 / total + 1.0 / level)
             labels += [Label(float(x), "all", f"along {lines}", ids, out) for x in bands.middle]
             white_dn2 = 1.0 / float(np.average([1.0 / c.white_dn2 for c in part], weights=weight))
             along.append((lines, bands, frequency, white_dn2, float(weight.sum())))

@@ -22,7 +22,6 @@ from sim.spectrum import FloatArray
 TRAIL_LAGS = 1, 2, 3, 4, 6, 9  # px from the hot pixel
 HOT = 12.0  # local standard deviations from which on a pixel counts as hot
 LEAST_HOT = 12  # hot pixels of a half of the frame
-TRAIL_FLOOR = 1e-4  # standard deviation of a share beside chance
 #: Ratio of the variances of the median and of the mean of many normal numbers.
 MEDIAN_VARIANCE = np.pi / 2.0
 
@@ -117,7 +116,7 @@ def measure_dark_trails(dataset: Dataset) -> Observable:
 
     return Observable(
         measurement=DARK_TRAILS, reach=2.0, value=np.array([one.share for one in values]),
-        covariance=covariance + TRAIL_FLOOR**2 * np.eye(len(values)), labels=tuple(labels),
+        covariance=covariance, labels=tuple(labels),
         reads=frozenset({"charge.trails"}), predict=predict, scale=np.full(len(values), 0.01),
     )  # fmt: skip
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lab.errors import NotDetermined
+from lab.errors import InputError, NotDetermined
 from lab.observables.edges.spread import SortedSamples, Spline
 from sim.camera import Cfa
 from sim.sensor.mosaic import phases
@@ -132,9 +132,13 @@ class Plane:
 def region_planes(frame: NDArray[np.generic], region: Region, cfa: Cfa, channel: str) -> list[Plane]:
     """Cut the planes of a channel (two for green) within `region` out of a raw frame (rows, cols), in codes.
 
-    `region`: (row0, col0, row1, col1), end excluded. The planes keep their coordinates on the sensor.
+    `region`: (row0, col0, row1, col1), end excluded. The planes keep their coordinates on the sensor. Raises
+    `InputError` where the region isn't inside the frame: a negative column would be counted from the other border.
     """
     row0, col0, row1, col1 = region
+    rows, cols = frame.shape
+    if not (0 <= row0 < row1 <= rows and 0 <= col0 < col1 <= cols):
+        raise InputError(f"region {list(region)} isn't inside the frame of {rows} x {cols}: give one that is")
     step = period(cfa)
     found = []
     for first_row, first_col in sorted(phases(cfa)[channel]):

@@ -17,7 +17,8 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.observables.charts.chart import measure_chart
-from lab.observables.codes.density import measure_code_density, widths
+from lab.observables.codes.density import measure_code_density
+from lab.observables.codes.landings import widths
 from lab.observables.darks.level import measure_dark
 from lab.observables.dataset import Dataset
 from lab.observables.flats.linearity import measure_photon_transfer

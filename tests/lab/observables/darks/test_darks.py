@@ -13,6 +13,7 @@ from scipy import stats
 
 from evaluation.draw import recordings_of
 from evaluation.independent_simulator import ConcealedCamera, Law, Plan, laws
+from evaluation.observables import scatter
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.side_model import measurement_model
@@ -46,7 +47,7 @@ OF_DARK_FRAMES = [one for one in measurements() if one.order < 200]
 
 def _sim_darks(
     seed: int, acting: Sequence[Effect] = (), *, bits: int = 12, cfa: Any = "MONO", plan: Sequence[tuple[float,
-    float]] = (), read_e: float = 3.0, dark: float = 8.0
+    float]] = (), read_e: float = 3.0, dark: float = 8.0, shape: tuple[int, int] = (ROWS, COLS)
 ) -> RecordingSet:  # fmt: skip
     """Dark frames of `sim`'s own camera, (exposure, temperature) each."""
     rng = np.random.default_rng([seed, 1])
@@ -54,7 +55,8 @@ def _sim_darks(
     channels = ("Y",) if cfa == "MONO" else ("R", "G", "B")
     black, gain = 0.03 * white, 0.97 * white / 10000.0
     camera = CameraModel(
-        rows=ROWS, cols=COLS, pixel_pitch_um=3.0, fill_factor=0.8, cfa=cfa, bit_depth=bits, black_level_dn=black,
+        rows=shape[0], cols=shape[1], pixel_pitch_um=3.0, fill_factor=0.8, cfa=cfa, bit_depth=bits,
+        black_level_dn=black,
         white_level_dn=white,
         conversion_gain_dn_per_e=gain, full_well_e=10000.0, read_noise_e=read_e, dark_current_e_per_s=dark, dsnu_e=1.0,
         prnu_percent=0.7,
@@ -72,7 +74,7 @@ def _sim_darks(
         for k, (t, c) in enumerate(plan)
     ]
     stated = {
-        "rows": ROWS, "cols": COLS, "pixel_pitch_um": 3.0, "fill_factor": 0.8, "cfa": cfa, "bit_depth": bits,
+        "rows": shape[0], "cols": shape[1], "pixel_pitch_um": 3.0, "fill_factor": 0.8, "cfa": cfa, "bit_depth": bits,
         "black_level_dn": black,
         "white_level_dn": white, "conversion_gain_dn_per_e": gain, "f_number": 4.0, "focal_length_mm": 8.0,
     }  # fmt: skip
@@ -265,6 +267,21 @@ def test_healthy_darks_agree_with_their_covariance() -> None:
             value = chi2(model.seen_value - gaussian.mean, gaussian.covariance)
             rare = min(rare, float(stats.chi2.sf(value, int(seen.sum()))))
     assert rare > 1.0 / 30_000.0
+
+
+@pytest.mark.parametrize(("bits", "read_e"), [(10, 1.5), (12, 3.0)], ids=["hardly dithered", "dithered"])
+def test_covariances_of_darks_are_neither_too_wide_nor_too_narrow(bits: int, read_e: float) -> None:
+    """Over six cameras of 240 x 320 px each measurement's chi2 is its number of directions within 3.5 sqrt(2 n), as
+    there are six of them. Noise of 0.15 DN is too coarse for all but the means."""
+    found: dict[str, list[tuple[float, int]]] = {}
+    for k in range(6):
+        dataset, blocks, _ = _blocks(_sim_darks(300 + k, bits=bits, read_e=read_e, shape=(240, 320)))
+        for one in scatter(MeasurementModel(tuple(blocks), dataset.camera)):
+            found.setdefault(one.observable, []).append((one.chi2, one.n))
+    names = {"dark", "dark_noise", "dark_field", "dark_row_noise", "dark_row_pattern", "dark_correlation"}
+    for name in names if bits == 12 else {"dark", "dark_field"}:
+        total, number = np.sum(found[name], axis=0)
+        assert abs(total - number) < 3.5 * np.sqrt(2.0 * number), (name, total, number)
 
 
 @pytest.mark.parametrize("seed", [81, 82])

@@ -15,7 +15,7 @@ from scipy.linalg import solve_triangular
 from evaluation.draw import recordings_of
 from evaluation.independent_simulator import ConcealedCamera, Plan
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.errors import NotDetermined
+from lab.errors import InputError, NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.dataset import Dataset
@@ -123,6 +123,29 @@ def test_a_prediction_is_what_the_estimator_reports_of_the_mean_frame(cfa: str, 
             edges.append(SideEdge((capture,), channel, summary, False, region, 0.0))
     predicted = PredictedEdges(dataset, edges, drawn.camera)
     np.testing.assert_allclose(predicted.value, predicted.predict(()), atol=3.0 * EDGE_FLOOR)
+
+
+@pytest.mark.parametrize("cfa", ["RGGB", "GRBG", "GBRG", "BGGR"])
+@pytest.mark.parametrize(("rows", "cols"), [(150, 98), (98, 150)])
+def test_edges_of_tall_and_wide_frames_of_another_simulator_are_predicted(cfa: str, rows: int, cols: int) -> None:
+    """chi2 of n numbers is n within four standard deviations, those of each edge's noise included. The camera's own
+    spectra and lens are stated, and its regions lie in the frame."""
+    former = ConcealedCamera(7, (), rows=rows, cols=cols, cfa=cfa, bit_depth=10)
+    given = recordings_of(former, Plan(("dark", "slanted_edge")))
+    for capture in given.captures():
+        assert not list(capture.problems(rows, cols))
+    dataset = Dataset(given, "left", camera_model(given, "left", None, maker_curves=True))
+    block = measure_slanted_edge(dataset)
+    n = len(block.value)
+    prediction = block.predict(())
+    nuisances = np.reshape(list(prediction.jacobian.values()), (-1, n))
+    found = chi2(block.value - prediction.mean, block.covariance + nuisances.T @ nuisances)
+    assert found - n < 4.0 * np.sqrt(2.0 * n + NUMBERS * n * 2.0 / 120.0)
+
+
+def test_a_region_outside_the_frame_is_refused() -> None:
+    with pytest.raises(InputError, match=r"region \[4, -22, 146, 120\] isn't inside the frame of 150 x 98"):
+        region_planes(np.zeros((150, 98)), (4, -22, 146, 120), "GBRG", "R")
 
 
 def test_a_region_that_reaches_too_little_is_refused() -> None:
