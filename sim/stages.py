@@ -33,7 +33,7 @@ from sim.sensor.defects import Defects, Jumps
 from sim.sensor.electrons import NEIGHBOURS, NO_MULTIPLICATION, Multiplication
 from sim.sensor.lines import LineGains, LineNoise
 from sim.sensor.particles import Particles
-from sim.sensor.reading_order import OrderedNoise
+from sim.sensor.reading_order import ReadOutNoise
 from sim.sensor.trails import Trails, read_combs
 from sim.spectrum import FloatArray
 
@@ -631,7 +631,7 @@ class Signal(State):
     exposure_offset_dn: tuple[Callable[[float], float], ...] = ()
     noise_e2: tuple[Callable[[float], float], ...] = ()
     lines: tuple[LineNoise, ...] = ()
-    reading_order: tuple[OrderedNoise, ...] = ()
+    reading_order: tuple[ReadOutNoise, ...] = ()
     telegraph: tuple[Jumps, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
     filters: tuple[FloatArray, ...] = ()

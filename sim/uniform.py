@@ -19,7 +19,7 @@ from sim.sensor.amplifiers import CoupledAmplifiers
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.lines import LineGains, LineNoise, Lines
 from sim.sensor.particles import Particles
-from sim.sensor.reading_order import OrderedNoise
+from sim.sensor.reading_order import ReadOutNoise
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, codes_of, image_of, light_of, signal_of
 
@@ -512,7 +512,7 @@ class Uniform:
         return self._signal.lines
 
     @property
-    def reading_order(self) -> tuple[OrderedNoise, ...]:
+    def reading_order(self) -> tuple[ReadOutNoise, ...]:
         """Noise in the order in which pixels are read."""
         return self._signal.reading_order
 
