@@ -116,10 +116,10 @@ def bring_in(store: Store, cameras: Mapping[Side, CameraFile]) -> str:
 def remove(store: Store, model_id: str) -> None:
     """Delete a model that was sent in, for ever. Raises InputError where there is none, and for one that a fit or a
     diagnosis found."""
-    found = record(store, model_id)
-    if found.kind != "sent":
+    model = record(store, model_id)
+    if model.kind != "sent":
         raise InputError(
-            f"camera model {model_id}: is {found.kind}, part of a result; only those that were sent in can be deleted"
+            f"camera model {model_id}: is {model.kind}, part of a result; only those that were sent in can be deleted"
         )
     with store.transaction() as db:
         db.execute(sa.delete(ResultRow).where(ResultRow.id == model_id))
@@ -180,20 +180,22 @@ def files(store: Store, result_id: str) -> Iterator[Path]:
     yield from sorted(_folder(store, result_id).iterdir())
 
 
-def camera_files(store: Store, found: CameraModelRecord) -> dict[Side, CameraFile]:
+def camera_files(store: Store, model: CameraModelRecord) -> dict[Side, CameraFile]:
     """Return the cameras themselves."""
-    folder = _folder(store, found.id)
-    return {side: read_camera(folder / f"{side}.toml") for side in found.sides}
+    folder = _folder(store, model.id)
+    return {side: read_camera(folder / f"{side}.toml") for side in model.sides}
 
 
-def cameras(store: Store, found: CameraModelRecord) -> dict[Side, ModelOfCamera]:
+def cameras(store: Store, model: CameraModelRecord) -> dict[Side, ModelOfCamera]:
     """Return what each camera file says."""
-    return {side: _camera(content) for side, content in camera_files(store, found).items()}
+    return {side: _camera(content) for side, content in camera_files(store, model).items()}
 
 
 def _camera(content: CameraFile) -> ModelOfCamera:
     model = content.camera
-    lens = [one.model_copy(update={"name": f"lens.{one.name}"}) for one in _parameters(model.lens, {})]
+    lens = [
+        parameter.model_copy(update={"name": f"lens.{parameter.name}"}) for parameter in _parameters(model.lens, {})
+    ]
     return ModelOfCamera(
         name=content.name,
         cfa=model.cfa,

@@ -84,10 +84,10 @@ def _check_takes_files(folder: Path, wanted: Path) -> None:
     exists."""
     from lab.capture.room import why_unwritable
 
-    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
-    if not there.is_dir():
-        raise InputError(f"{wanted}: can't be written into a folder, {there} is none; name another place")
-    if (why := why_unwritable(there)) is not None:
+    existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
+    if not existing.is_dir():
+        raise InputError(f"{wanted}: can't be written into a folder, {existing} is none; name another place")
+    if (why := why_unwritable(existing)) is not None:
         raise why
 
 

@@ -74,8 +74,8 @@ class Replay:
         return self.recordings.with_frames(frames)
 
     def _scene_key(self, capture: Capture, effects: Sequence[Effect]) -> object:
-        told = capture.model_dump(exclude={"id", "frame", "time"})
-        return repr(told) if is_steady(self.camera, effects) else capture.id
+        statements = capture.model_dump(exclude={"id", "frame", "time"})
+        return repr(statements) if is_steady(self.camera, effects) else capture.id
 
     def _electrons(self, capture: Capture, effects: Sequence[Effect]) -> tuple[Exposure, FloatArray]:
         edge = self._edge(capture) if isinstance(capture, SlantedEdgeCapture) else None
@@ -124,8 +124,8 @@ class Replay:
             plane = np.zeros(electrons.shape, bool)
             for row, col in phases:
                 plane[row::step, col::step] = True
-            lit, seen = (electrons - dark)[plane & inside], (recorded - dark)[plane & inside]
-            slope, level = np.polyfit(lit, seen, 1)
+            lit, measured = (electrons - dark)[plane & inside], (recorded - dark)[plane & inside]
+            slope, level = np.polyfit(lit, measured, 1)
             out[plane] = np.maximum(slope * (electrons - dark)[plane] + level, 0.0) + dark[plane]
         return out
 

@@ -218,9 +218,9 @@ def _edges(
     if not captures:
         raise NotDetermined("mtf", "no slanted-edge captures")
     settings: dict[object, list[SlantedEdgeCapture]] = {}
-    for found in captures:
-        key = (found.region, found.angle_deg, found.exposure_s, found.gain_db, found.light_radiance)
-        settings.setdefault(key, []).append(found)
+    for edge in captures:
+        key = (edge.region, edge.angle_deg, edge.exposure_s, edge.gain_db, edge.light_radiance)
+        settings.setdefault(key, []).append(edge)
     checks, reason = [], ""
     for repeats in settings.values():
         capture = repeats[0]
@@ -295,17 +295,17 @@ def _kernels(
     screens = {c.id: c.screen for c in recordings.captures(BernoulliCapture, side)}
     by_capture: dict[str, list[KernelPair]] = {}
     numbers: dict[str, list[tuple[FloatArray, FloatArray, FloatArray]]] = {}
-    for found in fit.psf:
-        if found.sample_pitch_px != 1.0:
+    for psf in fit.psf:
+        if psf.sample_pitch_px != 1.0:
             continue
-        tell(found.capture)
-        screen = screens.get(found.capture)
+        tell(psf.capture)
+        screen = screens.get(psf.capture)
         light = recordings.spectrum(screen.radiance) if screen and screen.radiance else None
         cell_px = screen.cell_camera_px if screen else None
-        measured, std = np.array(found.psf), np.array(found.psf_std)
+        measured, std = np.array(psf.psf), np.array(psf.psf_std)
         predicted: FloatArray = np.asarray(
             expected_kernel(
-                lambda fx, fy, channel=found.channel, light=light: optical_transfer(  # type: ignore[misc]
+                lambda fx, fy, channel=psf.channel, light=light: optical_transfer(  # type: ignore[misc]
                     model, channel, light, fx, fy, effects, "bernoulli"
                 ),
                 len(measured),
@@ -315,13 +315,13 @@ def _kernels(
         )
         error = float(np.mean(np.square(measured - predicted)))
         peak = float(predicted.max())
-        by_capture.setdefault(found.capture, []).append(
+        by_capture.setdefault(psf.capture, []).append(
             KernelPair(
-                label=found.capture, channel=found.channel, predicted=_rows(predicted), measured=_rows(measured),
+                label=psf.capture, channel=psf.channel, predicted=_rows(predicted), measured=_rows(measured),
                 psnr_peak_db=_psnr(peak, error), psnr_unit_db=_psnr(1.0, error),
             )
         )  # fmt: skip
-        numbers.setdefault(found.capture, []).append(
+        numbers.setdefault(psf.capture, []).append(
             (
                 (measured - predicted).ravel(),
                 std.ravel() ** 2 + (KERNEL_FLOOR * peak) ** 2,
@@ -409,15 +409,15 @@ def predict_both(
     for side, camera in improved.items():
         maker = camera_model(recordings, side, fit.cameras.get(side), maker_curves=True).quantum_efficiency
         baseline[side] = baseline_of(camera, (always or {}).get(side), maker if side in discrepant else None)
-    is_other = discrepant or any(improved[side].effects != one.effects for side, one in baseline.items())
+    is_other = discrepant or any(improved[side].effects != camera.effects for side, camera in baseline.items())
 
     def checks(models: Mapping[Side, CameraFile], name: str, begun: float) -> tuple[Check, ...]:
         def tell(what: str, share: float) -> None:
             if progress is not None:
                 progress(f"{name}: {what}", begun + 0.5 * share)
 
-        found = validate(recordings, fit, models, tell).checks
-        return tuple(check for check in found if check.side in models)
+        checks = validate(recordings, fit, models, tell).checks
+        return tuple(check for check in checks if check.side in models)
 
     return BothModels(
         baseline=checks(baseline, "baseline", 0.0),
@@ -450,8 +450,12 @@ def _apparent(file: CameraFile, channel: str, wavelength_nm: float) -> float:
     line = Spectrum.of(
         np.array([wavelength_nm - LINE_NM, wavelength_nm, wavelength_nm + LINE_NM]), np.array([0.0, 1.0, 0.0])
     )
-    own = float(file.camera.quantum_efficiency[channel].at(wavelength_nm))
+    efficiency = float(file.camera.quantum_efficiency[channel].at(wavelength_nm))
     if not file.effects:
-        return own
+        return efficiency
     plain = electron_rate(file.camera, channel, line)
-    return own * electron_rate(file.camera, channel, line, file.effects, "narrowband") / plain if plain > 0.0 else own
+    return (
+        efficiency * electron_rate(file.camera, channel, line, file.effects, "narrowband") / plain
+        if plain > 0.0
+        else efficiency
+    )
