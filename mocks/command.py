@@ -319,7 +319,7 @@ def bench(
     """
     with _one_line_errors():
         faults = _bench_faults(fault or [])
-        concealed = _concealed(conceal or [], healthy)
+        concealed = _parse_concealed(conceal or [], healthy)
         stop = threading.Event()
         with _ended_by_signals(stop), contextlib.ExitStack() as running:
             line = _BenchLine(host, advertise or host, serial_over_tcp, display)
@@ -361,7 +361,7 @@ class _BenchLine:
         return self.display, {"driver": "browser", "address": f"0.0.0.0:{port}", "allow_remote": True}
 
 
-def _concealed(specs: list[str], healthy: bool) -> Concealed | None:
+def _parse_concealed(specs: list[str], healthy: bool) -> Concealed | None:
     """Return the effects to conceal, from the command line, else from the environment; None: the bench's default
     ones."""
     from mocks.conceal import ConcealError, parse

@@ -42,7 +42,7 @@ def parse(specs: Iterable[str]) -> Concealed:
     chosen."""
     found: dict[Side, tuple[Effect, ...]] = {"left": (), "right": ()}
     for spec in specs:
-        sides, effect = _parsed(spec.strip())
+        sides, effect = _parse(spec.strip())
         for side in sides:
             if any(type(other) is type(effect) for other in found[side]):
                 raise ConcealError(f"--conceal {spec}: {effect.name} is concealed on the {side} already; give it once")
@@ -50,7 +50,7 @@ def parse(specs: Iterable[str]) -> Concealed:
     return found
 
 
-def _parsed(spec: str) -> tuple[tuple[Side, ...], Effect]:
+def _parse(spec: str) -> tuple[tuple[Side, ...], Effect]:
     where, _, rest = spec.partition(":")
     name, _, text = rest.partition(":")
     sides: tuple[Side, ...] = SIDES if where == "both" else tuple(side for side in SIDES if side == where)

@@ -143,16 +143,16 @@ def _record(store: Store, row: Any) -> CameraModelRecord:
     return CameraModelRecord(id=row.id, kind=KINDS[row.kind], source=row.source, created=row.created, sides=sides)
 
 
-def _asked() -> Any:
+def _select_models() -> Any:
     return sa.select(ResultRow.id, ResultRow.kind, ResultRow.source, ResultRow.created).where(ResultRow.kind.in_(KINDS))
 
 
 def records(store: Store, after: str | None = None, limit: int | None = None) -> list[CameraModelRecord]:
     """Camera models, the newest first: `limit` at most, those that follow `after` in this order."""
-    asked = _asked().order_by(ResultRow.created.desc(), ResultRow.id.desc()).limit(limit)
+    asked = _select_models().order_by(ResultRow.created.desc(), ResultRow.id.desc()).limit(limit)
     with store.reading() as db:
         if after is not None:
-            last = db.execute(_asked().where(ResultRow.id == after)).first()
+            last = db.execute(_select_models().where(ResultRow.id == after)).first()
             if last is None:
                 raise InputError(f"camera model {after!r} isn't known; list them for their ids")
             asked = asked.where(sa.tuple_(ResultRow.created, ResultRow.id) < sa.tuple_(last.created, last.id))
@@ -169,7 +169,7 @@ def count(store: Store) -> int:
 def record(store: Store, result_id: str) -> CameraModelRecord:
     """One. Raises InputError where there is none."""
     with store.reading() as db:
-        row = db.execute(_asked().where(ResultRow.id == result_id)).first()
+        row = db.execute(_select_models().where(ResultRow.id == result_id)).first()
     if row is None:
         raise InputError(f"no camera model {result_id[:60]!r}; list them for their ids")
     return _record(store, row)

@@ -177,7 +177,7 @@ def check_certified(store: Store, instruments: Snapshots, station: Station) -> N
     have the settings."""
     register(store)
     cameras = cameras_of(instruments, station)
-    asked = _asked().order_by(CalibrationRow.created.desc())
+    asked = _select_rows().order_by(CalibrationRow.created.desc())
     with store.reading() as db:
         of_rig = db.execute(asked.where(CalibrationRow.rig == rig_of(cameras)))
         history = [_calibration(row, name) for row, name in of_rig]
@@ -229,7 +229,7 @@ def check_nothing_rests_on(store: Store, session_id: str) -> None:
     register(store)
     with store.reading() as db:
         calibrations = [
-            _calibration(*row) for row in db.execute(_asked().where(CalibrationRow.session_id == session_id))
+            _calibration(*row) for row in db.execute(_select_rows().where(CalibrationRow.session_id == session_id))
         ]
     for calibration in calibrations:
         if calibration.state == "certified":
@@ -341,7 +341,7 @@ def _calibration(row: CalibrationRow, name: str) -> CalibrationRecord:
     )
 
 
-def _asked() -> Any:
+def _select_rows() -> Any:
     """Calibrations with their sessions' names; a session that was deleted has its id for one."""
     name = sa.func.coalesce(SessionRow.name, CalibrationRow.session_id)
     return sa.select(CalibrationRow, name).outerjoin(SessionRow, SessionRow.id == CalibrationRow.session_id)
@@ -350,7 +350,7 @@ def _asked() -> Any:
 def calibrations(store: Store, after: str | None = None, limit: int | None = None) -> list[CalibrationRecord]:
     """Calibrations, the newest first: `limit` at most, those that follow the calibration `after` in this order."""
     register(store)
-    asked = _asked().order_by(CalibrationRow.created.desc(), CalibrationRow.id.desc()).limit(limit)
+    asked = _select_rows().order_by(CalibrationRow.created.desc(), CalibrationRow.id.desc()).limit(limit)
     with store.reading() as db:
         if after is not None:
             last = db.get(CalibrationRow, after)
@@ -370,7 +370,7 @@ def count_calibrations(store: Store) -> int:
 def calibration(store: Store, id: str) -> CalibrationRecord:
     """One calibration, by its own id or by its session's: the newest of that. Raises InputError where there is none."""
     register(store)
-    wanted = _asked().where(sa.or_(CalibrationRow.id == id, CalibrationRow.session_id == id))
+    wanted = _select_rows().where(sa.or_(CalibrationRow.id == id, CalibrationRow.session_id == id))
     with store.reading() as db:
         newest = db.execute(wanted.order_by(CalibrationRow.created.desc())).first()
     if newest is None:
@@ -672,7 +672,7 @@ def _board_columns(store: Store, camera: str, newest: int) -> list[tuple[Calibra
     and the newest of all that was certified."""
     has = sa.select(FigureRow.calibration_id).where(FigureRow.camera == camera)
     with store.reading() as db:
-        rows = list(db.execute(_asked().where(CalibrationRow.id.in_(has)).order_by(CalibrationRow.created)))
+        rows = list(db.execute(_select_rows().where(CalibrationRow.id.in_(has)).order_by(CalibrationRow.created)))
     certified = [row.id for row, _ in rows if row.certified is not None and row.revoked is None]
     last = {row.session_id: row.id for row, _ in rows}
     kept = [of for of in rows if last[of[0].session_id] == of[0].id or of[0].certified is not None]
@@ -760,7 +760,7 @@ def drafted_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], tuple[str,
     judged. A draft says what is usual, not what a camera has to reach: somebody decides that."""
     wanted = calibration(store, id)
     rig = rig_of(wanted.cameras)
-    asked = _asked().where(CalibrationRow.rig == rig, CalibrationRow.revoked.is_(None))
+    asked = _select_rows().where(CalibrationRow.rig == rig, CalibrationRow.revoked.is_(None))
     with store.reading() as db:
         known = [row for row, _ in db.execute(asked.order_by(CalibrationRow.created))]
     last = {row.session_id: row.id for row in known}

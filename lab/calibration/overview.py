@@ -81,7 +81,7 @@ def overviews(store: Store, sessions: Sequence[str]) -> dict[str, SessionOvervie
     verdicts = _diagnoses(store, sessions)
     overviews = {}
     for session, station, runs in kept:
-        id, cameras = newest.get(session, (None, _reported(runs)))
+        id, cameras = newest.get(session, (None, _list_reported(runs)))
         shown: dict[str, Any] = {name: of.get(id or "", {}) for name, of in figures.items()}
         overviews[session] = SessionOverview(
             station=station or "", cameras=cameras, calibration_id=id, verdict=verdicts.get(session), **shown
@@ -100,7 +100,7 @@ def _means(db: Any, calibrations: Sequence[str], patterns: Sequence[str]) -> dic
     return figures
 
 
-def _reported(runs: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+def _list_reported(runs: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Return the cameras of a session's last run as they reported themselves, by side."""
     instruments: Mapping[str, Mapping[str, str]] = runs[-1]["instruments"] if runs else {}
     return {

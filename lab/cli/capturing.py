@@ -92,7 +92,7 @@ def capture(
             demands_certified=certified,
         ),
     )
-    out.print(f"session: {_carried_out(request, store, station, conceal, ['capture']).session}")
+    out.print(f"session: {_carry_out(request, store, station, conceal, ['capture']).session}")
 
 
 @commands.command()
@@ -185,7 +185,7 @@ def run(
     verb += ["--resolve"] if resolve else []
     verb += [] if resolve_minutes is None else [f"--resolve-minutes={resolve_minutes:g}"]
     verb += [] if resolve_rounds is None else [f"--resolve-rounds={resolve_rounds}"]
-    result = _carried_out(request, store, station, conceal, verb)
+    result = _carry_out(request, store, station, conceal, verb)
     assert result.fit is not None
     assert result.validation is not None
     assert result.diagnosis is not None
@@ -207,7 +207,7 @@ def _report_session(store: Store, station: Path | None, conceal: list[str] | Non
     from lab.cli.standards import report_standards
     from lab.report.standards_pdf import has_matplotlib
 
-    session = _carried_out(request, store, station, conceal, ["run", "--standards"]).session
+    session = _carry_out(request, store, station, conceal, ["run", "--standards"]).session
     assert session is not None
     recordings = session_recordings(store, session)
     fitted = run_here(PipelineRequest("fit", recordings=recordings, source=session), store).fit
@@ -331,7 +331,7 @@ def confirm_step(
         out.print("no session waits for an operator")
 
 
-def _carried_out(
+def _carry_out(
     request: PipelineRequest, store: Store, station_file: Path | None, conceal: list[str] | None, verb: list[str]
 ) -> PipelineResult:
     """Carry out a request in this thread, with captures on the station of a file, or on a mock bench that is started

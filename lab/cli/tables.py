@@ -100,7 +100,7 @@ def print_fit(recordings: RecordingSet, fit: FitResult) -> None:
 
 def _print_emva1288(fit: FitResult) -> None:
     """The standard's own figures of each camera, by plane of its mosaic, and what the standard's recordings lack."""
-    from lab.report.emva import compared_estimates, table_rows
+    from lab.report.emva import compare_estimates, table_rows
 
     for side, camera in fit.cameras.items():
         if camera.noise is None or not camera.noise.emva1288:
@@ -114,7 +114,7 @@ def _print_emva1288(fit: FitResult) -> None:
         out.print(table)
         for remark in dict.fromkeys(remark for plane in planes.values() for remark in plane.remarks):
             out.print(f"{side}: EMVA 1288: {escape(remark)}")
-        for line in compared_estimates(camera.noise):
+        for line in compare_estimates(camera.noise):
             out.print(f"{side}: {escape(line)}")
         out.print()
 

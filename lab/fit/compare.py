@@ -479,7 +479,7 @@ class FailRule:
         """Tell whether the rule names a figure of a side."""
         return fnmatchcase(name, self.figure) and self.side in (None, side)
 
-    def _exceeded(self, row: Change) -> bool:
+    def _exceeds(self, row: Change) -> bool:
         """Tell whether a change is larger than the amount."""
         return abs(row.difference) > self.amount * (abs(row.a) if self.relative else 1.0)
 
@@ -494,7 +494,7 @@ class FailRule:
         rows = [
             " ".join(part for part in (row.side, row.name, row.where) if part)
             for row in comparison.changes
-            if row.changed and self._names(row.name, row.side) and self._exceeded(row)
+            if row.changed and self._names(row.name, row.side) and self._exceeds(row)
         ]
         projections = [
             f"{item.side} {PROJECTION}"

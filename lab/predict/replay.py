@@ -86,14 +86,14 @@ class Replay:
         )  # fmt: skip
         electrons = expected_electrons(self.camera, exposure, effects)
         if isinstance(capture, SlantedEdgeCapture):
-            electrons = self._levelled(capture, exposure, electrons, effects)
+            electrons = self._level(capture, exposure, electrons, effects)
         return exposure, electrons
 
     def _scene(self, capture: Capture, edge: EdgeSummary | None) -> Scene:
         if isinstance(capture, SlantedEdgeCapture) and edge is not None:
             light = self.recordings.spectrum(capture.light_radiance) if capture.light_radiance else _EQUAL
             dark = Spectrum.of(*(light.arrays[0], 0.0 * light.arrays[1]))
-            return KnifeEdge((_placed(self._region(capture), edge),), dark, light)
+            return KnifeEdge((_place_edge(self._region(capture), edge),), dark, light)
         scene = capture.scene(self.recordings.spectrum)
         if scene is None:
             raise NotDetermined("replay", f"{capture.id} ({capture.kind}) doesn't tell what stood before the camera")
@@ -107,7 +107,7 @@ class Replay:
     def _region(self, capture: SlantedEdgeCapture) -> tuple[int, int, int, int]:
         return capture.region or (0, 0, self.camera.rows, self.camera.cols)
 
-    def _levelled(
+    def _level(
         self, capture: SlantedEdgeCapture, exposure: Exposure, electrons: FloatArray, effects: Sequence[Effect]
     ) -> FloatArray:
         """Electrons with an edge's two levels matched to the recording, channel by channel, by a least squares line
@@ -130,7 +130,7 @@ class Replay:
         return out
 
 
-def _placed(region: tuple[int, int, int, int], edge: EdgeSummary) -> EdgeRegion:
+def _place_edge(region: tuple[int, int, int, int], edge: EdgeSummary) -> EdgeRegion:
     """Return a straight edge at the centre and the angle that the estimator found."""
     row, col = edge.curve.centre
     if edge.curve.transposed:

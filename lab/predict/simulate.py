@@ -389,7 +389,7 @@ def preview(frame: Frame, camera: CameraModel, white: Spectrum) -> NDArray[np.ui
     if camera.cfa == "MONO":
         linear = np.repeat(((frame - camera.black_level_dn) / span)[..., None], 3, axis=2)
     else:
-        linear = (_demosaicked(frame, camera) - camera.black_level_dn) / span
+        linear = (_demosaic(frame, camera) - camera.black_level_dn) / span
         balance = neutral(camera, white)
         if balance is not None:
             top = max(balance.values())
@@ -400,7 +400,7 @@ def preview(frame: Frame, camera: CameraModel, white: Spectrum) -> NDArray[np.ui
     return np.asarray(np.rint(255.0 * shown), np.uint8)
 
 
-def _demosaicked(frame: Frame, camera: CameraModel) -> FloatArray:
+def _demosaic(frame: Frame, camera: CameraModel) -> FloatArray:
     if min(frame.shape) < 4:
         return np.repeat(frame[..., None].astype(float), 3, axis=2)
     # OpenCV names a mosaic by the second row's second and third pixel.

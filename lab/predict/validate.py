@@ -232,7 +232,7 @@ def _edges(
             except NotDetermined as refused:
                 reason = refused.reason
                 continue
-            predicted = _predicted_mtf(recordings, capture, channel, measured, model, effects)
+            predicted = _predict_mtf(recordings, capture, channel, measured, model, effects)
             residuals.append(measured.mtf - predicted)
             blocks.append(measured.covariance + np.diag(np.full(len(predicted), MTF_FLOOR**2)))
             reference.append(np.maximum(predicted, 0.1))
@@ -255,7 +255,7 @@ def _edges(
     return checks
 
 
-def _predicted_mtf(
+def _predict_mtf(
     recordings: RecordingSet,
     capture: SlantedEdgeCapture,
     channel: str,

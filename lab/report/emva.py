@@ -154,7 +154,7 @@ def spectrogram(image: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(np.fft.rfftfreq(length)[1:], float), np.asarray(np.sqrt(power[1:]), float)
 
 
-def _smoothed(values: FloatArray, most: int = MOST_POINTS) -> FloatArray:
+def _smooth(values: FloatArray, most: int = MOST_POINTS) -> FloatArray:
     """At most `most` values: the largest of each run, as means would hide lines of a spectrum."""
     if values.size <= most:
         return values
@@ -168,7 +168,7 @@ def _spectrogram(name: str, image: FloatArray, left: float, unit: str) -> EmvaPl
     whole = float(np.sqrt(max(image.var() - left, 0.0)))
     for text, turned, colour in (("rows (horizontal)", image, AFTER), ("columns (vertical)", image.T, BEFORE)):
         frequency, amplitude = spectrogram(turned)
-        amplitude = _smoothed(amplitude)
+        amplitude = _smooth(amplitude)
         data.append(
             curve(text, floats(np.linspace(frequency[0], frequency[-1], amplitude.size)), floats(amplitude), colour)
         )
@@ -679,7 +679,7 @@ def data_sheets(recordings: RecordingSet, fit: FitResult) -> Iterator[EmvaSheet]
                     remark if len(which) == len(names) else f"{', '.join(which)}: {remark}"
                     for remark, which in grouped.items()
                 ),
-                *compared_estimates(noise),
+                *compare_estimates(noise),
             ),
             channels=tuple(noise.channels) if len(noise.channels) > 1 else (),
             channel_rows=tuple(_channel_rows(noise)),
@@ -712,7 +712,7 @@ BOTH_ESTIMATES = {
 APART_SIGMA = 2.0
 
 
-def compared_estimates(noise: NoiseFit) -> Iterator[str]:
+def compare_estimates(noise: NoiseFit) -> Iterator[str]:
     """Yield by how much the standard's figures and the joint fit's differ, in per cent and in combined standard
     deviations (which are too large where both use the same noise), and why they may: the system gain always, the
     others where they are apart."""

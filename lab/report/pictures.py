@@ -78,7 +78,7 @@ def difference_picture(difference: ArrayLike, limit: float, margin: int = 0) -> 
     return png_data_uri(mixed.round().astype(np.uint8))
 
 
-def trimmed_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> int:
+def trim_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> int:
     """Width of the border, in cells, in which all `kernels` stay below `share` of their highest value; at least 7 cells
     are left."""
     highest = max(float(kernel.max()) for kernel in kernels)

@@ -161,9 +161,9 @@ def _(result: ValidationResult) -> Iterator[Chart]:
         name = f"{check.side} {check.name} {check.capture}"
         title = f"{check.side}: {check.name} of {check.capture}, measured and predicted"
         if check.curves:
-            yield Chart(name, title, charts.predicted_curves(check.curves))
+            yield Chart(name, title, charts.draw_predicted_curves(check.curves))
         elif check.patches:
-            yield Chart(name, title, charts.predicted_patches(check.patches))
+            yield Chart(name, title, charts.draw_predicted_patches(check.patches))
 
 
 @charts_of.register

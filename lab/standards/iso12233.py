@@ -471,7 +471,7 @@ class Iso12233Field(Standard):
             raise NotDetermined(self.name, "no edge whose response falls to 50 %")
         return places
 
-    def _weighted(self, chosen: list[tuple[float, float, float, float]]) -> Estimate:
+    def _average_weighted(self, chosen: list[tuple[float, float, float, float]]) -> Estimate:
         values = np.array([place[2] for place in chosen])
         stds = np.array([place[3] for place in chosen])
         return Estimate(value=float(values.mean()), std=float(np.sqrt(np.sum(stds**2))) / len(chosen), unit="cy/px")
@@ -492,7 +492,7 @@ class Iso12233Field(Standard):
         chosen = [place for place in self._each if self._radius(place) <= 0.3]
         if not chosen:
             raise NotDetermined(self.name, "no edge within 0.3 of the half diagonal")
-        return self._weighted(chosen)
+        return self._average_weighted(chosen)
 
     @ClauseFigure
     def corner_sfr50(self) -> Estimate:
@@ -504,7 +504,7 @@ class Iso12233Field(Standard):
         chosen = [place for place in self._each if self._radius(place) >= 0.7]
         if not chosen:
             raise NotDetermined(self.name, "no edge beyond 0.7 of the half diagonal")
-        return self._weighted(chosen)
+        return self._average_weighted(chosen)
 
     @ClauseFigure
     def lowest_sfr50(self) -> Estimate:
@@ -513,7 +513,7 @@ class Iso12233Field(Standard):
         Clause: 6.2. Symbol: SFR50.min. Unit: cy/px.
         Formula: least of all edges.
         """
-        return self._weighted([min(self._each, key=lambda place: place[2])])
+        return self._average_weighted([min(self._each, key=lambda place: place[2])])
 
     def deviations(self) -> Iterator[Deviation]:
         yield from {deviation.line: deviation for edge in self.edges for deviation in edge.deviations()}.values()

@@ -548,14 +548,14 @@ def _level(row: TableRow, camera: DataSheet) -> tuple[Setting, PlaneStatistics]:
 def _without_patterns(fit: NoiseFit) -> NoiseFit:
     """Return the fit less the figures that need frames."""
 
-    def emptied(part: NoiseFit | ChannelNoise | Emva1288) -> dict[str, object]:
+    def empty_spatial(part: NoiseFit | ChannelNoise | Emva1288) -> dict[str, object]:
         return {name: None for name in type(part).model_fields if name.startswith(SPATIAL)}
 
-    channels = {c: part.model_copy(update=emptied(part)) for c, part in fit.channels.items()}
+    channels = {c: part.model_copy(update=empty_spatial(part)) for c, part in fit.channels.items()}
     figures = {}
     for c, part in fit.emva1288.items():
         remarks = tuple(text for text in part.remarks if not text.startswith("the spatial stacks"))
-        figures[c] = part.model_copy(update=emptied(part) | {"remarks": remarks})
+        figures[c] = part.model_copy(update=empty_spatial(part) | {"remarks": remarks})
     remark = "of a table of means and variances: DSNU, PRNU, shading and defects aren't determined"
-    update = emptied(fit) | {"channels": channels, "emva1288": figures, "remarks": (*fit.remarks, remark)}
+    update = empty_spatial(fit) | {"channels": channels, "emva1288": figures, "remarks": (*fit.remarks, remark)}
     return fit.model_copy(update=update)
