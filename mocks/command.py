@@ -366,11 +366,11 @@ def _parse_concealed(specs: list[str], healthy: bool) -> Concealed | None:
     ones."""
     from mocks.conceal import ConcealError, parse
 
-    told = specs or [part for part in os.environ.get(CONCEAL_VARIABLE, "").split(";") if part.strip()]
-    if healthy and told:
+    stated = specs or [part for part in os.environ.get(CONCEAL_VARIABLE, "").split(";") if part.strip()]
+    if healthy and stated:
         raise _Unusable("bench: --healthy conceals nothing; leave out --conceal, or --healthy")
     try:
-        return parse(told) if told or healthy else None
+        return parse(stated) if stated or healthy else None
     except ConcealError as error:
         raise _Unusable(str(error)) from error
 

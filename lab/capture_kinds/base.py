@@ -205,7 +205,9 @@ def names_in(item: Open) -> Iterator[tuple[str, Names, str]]:
         if isinstance(value, Open):
             yield from ((f"{key}.{inner}", mark, name) for inner, mark, name in names_in(value))
         elif isinstance(value, str):
-            mark = next((one for one in field.metadata if isinstance(one, Names)), None) or _mark(field.annotation)
+            mark = next(
+                (item_of_metadata for item_of_metadata in field.metadata if isinstance(item_of_metadata, Names)), None
+            ) or _mark(field.annotation)
             if mark is not None:
                 yield key, mark, value
 
@@ -215,9 +217,9 @@ O = TypeVar("O", bound=Open)  # noqa: E741
 
 def in_folder(item: O, folder: str) -> O:
     """Return the same object, each name and path in it prefixed by `folder/`."""
-    own = {key: f"{folder}/{name}" for key, _, name in names_in(item) if "." not in key}
+    paths = {key: f"{folder}/{name}" for key, _, name in names_in(item) if "." not in key}
     nested = {key: in_folder(value, folder) for key, value in item if isinstance(value, Open)}
-    return item.model_copy(update=own | nested)
+    return item.model_copy(update=paths | nested)
 
 
 CAPTURES: ByKind[Capture] = ByKind("capture")
@@ -323,7 +325,7 @@ class Setting(Frozen):
         """Journals that were written before there were other adjustments have the lenses' stop as `aperture`."""
         if not isinstance(value, dict) or "aperture" not in value:
             return value
-        kept = {key: one for key, one in value.items() if key != "aperture"}
+        kept = {key: part for key, part in value.items() if key != "aperture"}
         return kept if value["aperture"] is None else kept | {"by_hand": (value["aperture"],)}
 
 
@@ -468,8 +470,8 @@ def planned_keys(step_id: str, side: Side) -> dict[str, Any]:
 def usual_of(kind: type[Adjustment], station: Equipment) -> str:
     """Return the name of an adjustment's usual state. Raises InputError where the station has none, as nothing could
     be put back then."""
-    for name, one in station.list_targets(kind).items():
-        if one.is_usual(station):
+    for name, target in station.list_targets(kind).items():
+        if target.is_usual(station):
             return name
     wanted = get_args(kind.model_fields["kind"].annotation)[0]
     raise InputError(
