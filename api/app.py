@@ -98,9 +98,6 @@ EVERY_CHANGE = (*EVERYWHERE, 403, 507)
 open_to_all = APIRouter()
 
 
-# --- what needs no key ------------------------------------------------------------------------------------------------
-
-
 @open_to_all.get("/health", tags=["access"])
 def health() -> Health:
     """Whether the service is up."""
@@ -200,9 +197,6 @@ def static_file(name: str) -> Response:
 def favicon() -> Response:
     """There is no icon; browsers remember this answer for a day."""
     return Response(status_code=204, headers={"Cache-Control": "max-age=86400"})
-
-
-# --- the application --------------------------------------------------------------------------------------------------
 
 
 def create_app(

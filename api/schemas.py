@@ -820,9 +820,6 @@ class StoredPrediction(Schema):
     not_predicted: tuple[str, ...] = Field(default=(), description="why other numbers aren't predicted")
 
 
-# --- a station's devices ----------------------------------------------------------------------------------------------
-
-
 class DeviceState(Schema):
     """One instrument of a station, and how its latest self-test went."""
 

@@ -30,9 +30,6 @@ COOKIE_LIFETIME_S = 12 * 3600.0
 HALT_COOKIE = "calibench_halt"
 
 
-# --- logins of the page -----------------------------------------------------------------------------------------------
-
-
 @dataclass
 class Logins:
     """The logins of the operator's page: random tokens, kept in memory until the process ends."""
@@ -206,9 +203,6 @@ def set_cookies(response: Response, login: str, halt: str | None, *, secure: boo
             )
 
 
-# --- hosts ------------------------------------------------------------------------------------------------------------
-
-
 class SameHost:
     """Refuses a foreign Host (against DNS rebinding), and a foreign Origin where the request changes state (against
     cross-site requests)."""
@@ -252,8 +246,6 @@ class SameHost:
                 )
         return None
 
-
-# --- headers and bodies -----------------------------------------------------------------------------------------------
 
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "

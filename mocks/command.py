@@ -458,9 +458,6 @@ def _thread(running: contextlib.ExitStack, name: str, work: Callable[[], None]) 
     running.callback(thread.join, 5.0)
 
 
-# --- the station file -------------------------------------------------------------------------------------------------
-
-
 def station_toml(addresses: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any]) -> str:
     """Return the station file (TOML): an address a table, the cameras' data sheets, the targets' nominal layout."""
     tables: dict[str, Any] = {"name": "mock bench", "cameras": {}}
@@ -516,9 +513,6 @@ def _write(path: Path, text: str) -> None:
         raise _Unusable(
             f"{path}: can't be written ({error.strerror}); give a path in a folder that is there"
         ) from error
-
-
-# --- the process ------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager

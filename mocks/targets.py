@@ -247,9 +247,6 @@ def corners_px(warp: Warp, width: float, height: float) -> FloatArray:
     return np.stack([row, col], axis=1)
 
 
-# --- what a lab knows -------------------------------------------------------------------------------------------------
-
-
 def station_targets(cameras: Mapping[Side, HiddenCamera]) -> dict[str, Any]:
     """Nominal layout of the targets in the frames, for the station file's `[targets]`: as good as a hand that places
     them and an eye that reads them off a first picture (corners to half a pixel, regions to the pixel). Keys by target:

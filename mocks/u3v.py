@@ -116,9 +116,6 @@ FAULTS = {
 _OF_FRAMES = ("late", "never", "short", "lost-trailer", "damaged", "torn", "repeated", "missed", "unplug", "halt")
 
 
-# --- the camera's XML -------------------------------------------------------------------------------------------------
-
-
 def _xml(rows: int, cols: int) -> bytes:
     """Return the camera's description of itself, with this sensor's size and the addresses above filled in."""
     places = {name: f"{value:#x}" for name, value in globals().items() if name.isupper() and isinstance(value, int)}
@@ -147,9 +144,6 @@ def _float_of(bits: int) -> float:
 
 def _float_bits(value: float) -> int:
     return int(struct.unpack("<I", struct.pack("<f", value))[0])
-
-
-# --- the device -------------------------------------------------------------------------------------------------------
 
 
 class TriggerLine:

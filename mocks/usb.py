@@ -66,9 +66,6 @@ def backend(name: str, bench: Bench | None = None) -> InProcessBackend:
     return InProcessBackend(devices(name, bench))
 
 
-# --- in this process --------------------------------------------------------------------------------------------------
-
-
 class InProcessPipe(Pipe):
     """Calls a device model directly."""
 
@@ -105,7 +102,6 @@ class InProcessBackend(PipeBackend):
         return InProcessPipe(device.place)
 
 
-# --- over USB/IP ------------------------------------------------------------------------------------------------------
 # The layouts are written out here a second time on purpose: a mistake shared with the client would not be seen.
 
 _VERSION = 0x0111

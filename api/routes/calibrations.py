@@ -68,9 +68,6 @@ def _has_cameras(service: Service, calibration_id: str) -> bool:
         return False
 
 
-# --- figures ----------------------------------------------------------------------------------------------------------
-
-
 @functools.lru_cache(maxsize=32)
 def _figures(store: Store, fit: str) -> tuple[Figure, ...]:
     """Of a kept fit, which never changes, and is long."""
@@ -122,9 +119,6 @@ def session_figures(service: Here, session_id: SessionId) -> list[FigureOfFit]:
 def recordings_figures(service: Here, recordings_id: HexId) -> list[FigureOfFit]:
     """The figures of the newest fit of recordings that were sent in."""
     return _newest_figures(service, str(service.recordings(recordings_id)), f"recordings {recordings_id}")
-
-
-# --- certifying -------------------------------------------------------------------------------------------------------
 
 
 @router.get("/calibrations/{calibration_id}/drafted-limits", dependencies=[READ], responses=answers(401, 404, 422))

@@ -28,9 +28,6 @@ from lab.report.compare import render_comparison
 router = APIRouter(tags=["calibrations"])
 
 
-# --- camera models ----------------------------------------------------------------------------------------------------
-
-
 def _fields(service: Service, record: CameraModelRecord) -> CameraModels:
     recordings_id = service.inbox.id_of(record.source)
     of_session = recordings_id is None and record.kind != "sent"
@@ -113,8 +110,6 @@ def camera_model_archive(service: Here, model_id: HexId, form: Form) -> Response
     files = list(camera_models.files(service.store, model_id))
     return sent(packed(((file.name, file.read_bytes()) for file in files), form), f"camera-{model_id}", form)
 
-
-# --- comparisons ------------------------------------------------------------------------------------------------------
 
 Source = Annotated[
     str,

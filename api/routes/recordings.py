@@ -133,9 +133,6 @@ def get_recordings(service: Here, recordings_id: HexId) -> RecordingsDetail:
     )
 
 
-# --- captures ---------------------------------------------------------------------------------------------------------
-
-
 def _capture(recordings_id: str, number: int, capture: Capture) -> RecordedCapture:
     here = f"/api/v1/recordings/{recordings_id}/captures/{number}"
     document = capture.model_dump(mode="json", exclude_none=True)

@@ -53,9 +53,6 @@ from sim.camera import Side
 router = APIRouter()
 
 
-# --- stations ---------------------------------------------------------------------------------------------------------
-
-
 def station_state(service: Service, name: str) -> StationState:
     """What a station file says, or why it can't be used."""
     try:
@@ -85,9 +82,6 @@ def list_stations(service: Here) -> list[StationState]:
     """The station files in the folder `stations` of the data folder. They are written there, not sent: they name
     devices."""
     return [station_state(service, name) for name in service.station_files()]
-
-
-# --- sessions ---------------------------------------------------------------------------------------------------------
 
 
 def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
@@ -362,9 +356,6 @@ def session_events(service: Here, session_id: SessionId) -> EventSourceResponse:
     """Follow a session."""
     service.session(session_id)
     return stream(lambda stopping: _follow(service, session_id, stopping))
-
-
-# --- captures ---------------------------------------------------------------------------------------------------------
 
 
 def _capture(info: CaptureInfo) -> StoredCapture:

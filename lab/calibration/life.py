@@ -152,9 +152,6 @@ class DriftBoard(Frozen):
     rows: tuple[BoardRow, ...]
 
 
-# --- cameras ----------------------------------------------------------------------------------------------------------
-
-
 def cameras_of(instruments: Snapshots, station: Station) -> dict[Side, str]:
     """Name of each camera of a run: maker, model and serial number as it reports them. Without a serial number it is
     known by its station and side."""
@@ -241,9 +238,6 @@ def check_nothing_rests_on(store: Store, session_id: str) -> None:
             )
 
 
-# --- registering ------------------------------------------------------------------------------------------------------
-
-
 def register(store: Store) -> None:
     """Enter the fits of sessions that aren't in the registry of calibrations yet, with their figures."""
     with store.reading() as db:
@@ -300,9 +294,6 @@ def _entry(
         for figure in figures_of(FitResult.model_validate(document))
     ]
     return row, figures
-
-
-# --- reading ----------------------------------------------------------------------------------------------------------
 
 
 def _aware(at: datetime | None) -> datetime | None:
@@ -405,9 +396,6 @@ def figure_names(store: Store) -> list[tuple[str, str, str]]:
         return [(camera, name, place) for camera, name, place in sorted(db.execute(asked))]
 
 
-# --- certifying -------------------------------------------------------------------------------------------------------
-
-
 def certify(
     store: Store, id: str, by: str, limits: CalibrationLimits, *, accept_warnings: bool = False
 ) -> CalibrationRecord:
@@ -492,8 +480,6 @@ _LIFE = (
     CalibrationRow.expires,
     CalibrationRow.revoked,
 )
-
-# --- history ----------------------------------------------------------------------------------------------------------
 
 
 def history(
@@ -594,8 +580,6 @@ def _significance(a: Figure, b: Figure) -> float:
         return 0.0 if difference == 0.0 else sigma_of_probability(0.0)
     return sigma_of_probability(2.0 * float(special.ndtr(-abs(difference) / std[0])))
 
-
-# --- the drift board --------------------------------------------------------------------------------------------------
 
 #: Calibrations that a board shows, the newest, unless it is told.
 BOARD_COLUMNS = 20
@@ -727,8 +711,6 @@ def _cell(figure: Figure, point: HistoryPoint, reference_c: float | None) -> Boa
         drifted=point.drifted,
     )
 
-
-# --- limits from the history ------------------------------------------------------------------------------------------
 
 #: Figures for which limits are drafted, by their names as a limit writes them, and which ends a drafted one has.
 DRAFTED: dict[str, Literal["both", "low", "high"]] = {

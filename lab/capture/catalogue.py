@@ -125,8 +125,6 @@ def parse_parameters(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
     return dict(parameters)
 
 
-# --- the time ---------------------------------------------------------------------------------------------------------
-
 #: A step's sequence, and what it does.
 Work = tuple[str, tuple[str, ...]]
 

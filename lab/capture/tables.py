@@ -214,9 +214,6 @@ def use_alone(registry: Path) -> None:
     _alone.add(registry.resolve())
 
 
-# --- the database -----------------------------------------------------------------------------------------------------
-
-
 def open_engine(url: str) -> sa.Engine:
     """Return the database at a URL, PostgreSQL through psycopg. Raises InputError where it can't be opened."""
     try:

@@ -32,7 +32,6 @@ from sim.parameters import Frozen, Quantity
 from sim.scene.scenes import Scene
 from sim.spectrum import Spectrum
 
-# --- registry --------------------------------------------------------------------------------------------------------
 # Models of one family that a document's `kind` tells apart, as a type for a field of a pydantic model.
 
 
@@ -94,14 +93,9 @@ class ByKind(Generic[M]):
         return {"oneOf": [handler(model.__pydantic_core_schema__) for model in self.models.values()]}
 
 
-# --- base ------------------------------------------------------------
-
-
 Cells = NDArray[np.uint8]
 #: Longest exposure of a plan, and of a capture that was exposed in seconds.
 LONGEST_EXPOSURE_S = 3600.0
-
-# --- the manifest's entry ---------------------------------------------------------------------------------------------
 
 
 class Open(BaseModel):
@@ -225,8 +219,6 @@ def in_folder(item: O, folder: str) -> O:
 CAPTURES: ByKind[Capture] = ByKind("capture")
 AnyCapture = Annotated[Capture, CAPTURES]
 
-# --- the station's targets --------------------------------------------------------------------------------------------
-
 
 class Target(Frozen):
     """An object that can be put before the cameras, described by `[targets.NAME]` of the station file."""
@@ -259,8 +251,6 @@ class Adjustment(Target):
 TargetT = TypeVar("TargetT", bound=Target)
 TARGETS: ByKind[Target] = ByKind("target")
 AnyTarget = Annotated[Target, TARGETS]
-
-# --- the sequence of steps --------------------------------------------------------------------------------------------
 
 
 class CaptureLimits(Frozen):
@@ -499,9 +489,6 @@ def exposure_step(stem: str, what: str, setting: Setting, level: float, *, measu
         radiance=spectrum_path(id) if measures_light else None,
         exposure=FindExposure(level=level),
     )
-
-
-# --- the registry -----------------------------------------------------------------------------------------------------
 
 
 def register(kind: type[Capture]) -> None:

@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from lab.pipeline import PipelineProgress
 
 
-# --- What a command's exit code says. `InputError` (2) and `DeviceError` (3) carry theirs -----------------------------
-
-
+#: Exit codes; `InputError` (2) and `DeviceError` (3) carry theirs.
 EXIT_INTERNAL, EXIT_INPUT, EXIT_CHECK, EXIT_INTERRUPTED = 1, 2, 4, 130
 
 
@@ -109,9 +107,6 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: can't be made ({error.strerror}); name another folder") from error
-
-
-# --- The progress bar of long commands, on stderr where that is a terminal --------------------------------------------
 
 
 @contextlib.contextmanager

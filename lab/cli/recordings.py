@@ -268,9 +268,6 @@ def export(
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 
-# --- `calibench kinds` ------------------------------------------------------------------------------------------------
-
-
 @commands.command()
 def kinds(
     source: Annotated[

@@ -326,9 +326,6 @@ def camera_sha256(content: CameraFile) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
-
-
 def check_out(file: Path) -> None:
     """Refuse a file that can't be written, before the work. Raises InputError."""
     writer_of(file)
@@ -367,9 +364,6 @@ def preview_file(file: Path) -> Path:
 def record_file(file: Path) -> Path:
     """NAME.json beside the frame."""
     return file.with_name(f"{file.stem}.json")
-
-
-# --- preview ----------------------------------------------------------------------------------------------------------
 
 
 def neutral(camera: CameraModel, white: Spectrum) -> dict[str, float] | None:

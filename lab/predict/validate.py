@@ -113,9 +113,6 @@ def _check(
     )
 
 
-# --- the chart --------------------------------------------------------------------------------------------------------
-
-
 def _charts(
     recordings: RecordingSet,
     side: Side,
@@ -200,9 +197,6 @@ def _curve_std(model: CameraModel, channel: str, wavelength_nm: FloatArray) -> f
     return float(np.sqrt(np.sum(np.square(std.at(grid)))) / total) if total > 0 else 1.0
 
 
-# --- edges ------------------------------------------------------------------------------------------------------------
-
-
 def _edges(
     recordings: RecordingSet,
     side: Side,
@@ -277,9 +271,6 @@ def _diagonal(blocks: Sequence[NDArray[Any]]) -> FloatArray:
         out[at : at + len(block), at : at + len(block)] = block
         at += len(block)
     return out
-
-
-# --- kernels ----------------------------------------------------------------------------------------------------------
 
 
 def _kernels(

@@ -21,9 +21,6 @@ from sim.camera import Side
 from sim.parameters import Frozen
 from sim.sensor.mosaic import first_pixels, planes
 
-# --- A frame at a glance: histogram, mean and share of saturated pixels of each channel of the mosaic -----------------
-
-
 BINS = 64
 
 

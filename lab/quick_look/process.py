@@ -137,9 +137,6 @@ class QuickLook:
         return ""
 
 
-# --- the process ------------------------------------------------------------------------------------------------------
-
-
 def serve() -> None:
     """Answer questions from standard input until it ends, or nobody asks for `IDLE_S`."""
     os.nice(NICE)

@@ -27,8 +27,6 @@ from sim.camera import Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray
 
-# --- Parts of the data sheet's plots: a plot with its caption, markers, lines -----------------------------------------
-
 
 @dataclass(frozen=True)
 class EmvaPlot:
@@ -78,7 +76,6 @@ def floats(values: NDArray[np.floating[Any]]) -> list[float]:
     return [float(value) for value in values]
 
 
-# --- emva spatial ----------------------------------------------------------------------------------------------------
 # The data sheet's spatial plots: spectrograms, histograms and profiles of DSNU and PRNU.
 
 
@@ -279,7 +276,6 @@ def _profiles(name: str, image: FloatArray, unit: str) -> EmvaPlot:
     )
 
 
-# --- emva temporal ---------------------------------------------------------------------------------------------------
 # The data sheet's temporal plots: photon transfer, responsivity, SNR, linearity, dark current; and those of the joint
 # fit.
 
@@ -581,9 +577,6 @@ def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
         caption,
         of_plane=False,
     )
-
-
-# --- emva ------------------------------------------------------------
 
 
 MAP_WIDTH_PX = 300

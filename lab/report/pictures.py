@@ -129,9 +129,6 @@ def frame_picture(frame: NDArray[np.uint16], camera: DataSheet, width_px: int = 
     return photograph_data_uri((255 * display).round().astype(np.uint8))
 
 
-# --- Maps of single pixels as files: arrays for the correction of frames, and pictures of them ------------------------
-
-
 #: Field of `PixelMaps` -> (title, unit).
 MAPS = {
     "offset_dn": ("Offset", "DN"),

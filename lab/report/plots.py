@@ -126,9 +126,6 @@ def _on_white(value: Any) -> Any:
     return ON_WHITE.get(value, value) if isinstance(value, str) else value
 
 
-# --- which charts a result has ----------------------------------------------------------------------------------------
-
-
 @singledispatch
 def charts_of(result: object) -> Iterator[Chart]:
     """Yield the charts of a result, the one that tells most first; none of what has no chart."""

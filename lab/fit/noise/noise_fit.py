@@ -61,7 +61,6 @@ from lab.observables.noise.surface import DEFECT_SIGMA
 from lab.observables.weighted_lines import chi2_factor, root
 from sim.camera import Side
 
-# --- fixed pattern ---------------------------------------------------------------------------------------------------
 # Fixed pattern: DSNU, PRNU, and the symmetry of the shading.
 
 
@@ -156,10 +155,6 @@ def remark_on_shading(e: Evaluation) -> None:
         e.remarks.add(f"the flats' shading is asymmetric: {'; '.join(found)}, of the mean")
 
 
-# --- noise fit ------------------------------------------------------------
-
-
-# --- noise fit -----------------------------------------------------------------------------------------------------
 # The noise fit of one camera: all figures, by channel too, with the points of its plots.
 
 
@@ -356,7 +351,6 @@ def remark_on_planes(e: Evaluation) -> None:
         e.remarks.add(f"the planes differ in conversion gain ({listed} DN/e): the one given is their mean")
 
 
-# --- recordings ----------------------------------------------------------------------------------------------------
 # The noise fit of a recording set: darks and flats of one camera, grouped into levels.
 
 
@@ -452,7 +446,6 @@ def _lamps_of(
     }
 
 
-# --- The noise fit on a table of channel means and variances, for recordings whose frames aren't at hand --------------
 #
 # One row a level and channel, CSV with a header. Columns: `kind` (dark, flat), `exposure_s`, `mean_dn`, `variance_dn2`
 # (temporal, of single pixels), `pixels` (of the channel, over which both were taken), `repeats` (frames); where known
