@@ -745,10 +745,6 @@ class RecordingsDetail(Recordings):
     results: dict[str, str] = Field(description="kind -> id of the newest `fit`, `validate`, `diagnose`, `report`")
 
 
-# --- the twin
-# ----------------------------------------------------------------------------------------------------------
-
-
 class SetAsked(Asked):
     """Recordings: a session's, or some that were sent in."""
 
