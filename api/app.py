@@ -126,8 +126,8 @@ def ready(service: Here) -> Health:
 )
 def metrics(request: Request) -> Response:
     """Requests, sessions and jobs, as Prometheus reads them. Needs a key, in Prometheus' `authorization`."""
-    found: Metrics = request.app.state.metrics
-    return Response(found.text(), media_type=CONTENT_TYPE_PLAIN_0_0_4)
+    metrics: Metrics = request.app.state.metrics
+    return Response(metrics.text(), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
 @open_to_all.post("/login", tags=["access"], responses=answers(401, 403, 413, 422, 429))
