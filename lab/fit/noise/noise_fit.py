@@ -247,7 +247,7 @@ def channel_figures(e: Evaluation, principal: dict[str, float | None]) -> dict[s
 
 
 def emva1288_by_plane(e: Evaluation) -> dict[str, Emva1288]:
-    """Figures by the letter of EMVA 1288, by plane; what a plane lacks is reported."""
+    """Compute the figures as specified in EMVA 1288, by plane; what a plane lacks is reported."""
     found: dict[str, Emva1288] = {}
     main = sorted(main_lamp_levels(e), key=lambda level: level.light)
     lamp = main[0].lamp

@@ -80,7 +80,7 @@ class NoiseFit(ChannelNoise):
     #: noise explains them. It is part of the uncertainties of responsivity, quantum efficiency and linearity.
     response_scatter_percent: float | None = None
     channels: dict[str, ChannelNoise] = {}
-    #: By plane of the mosaic (`R`, `G1`, `G2`, `B`, or `Y`), by the letter of the standard.
+    #: By plane of the mosaic (`R`, `G1`, `G2`, `B`, or `Y`), as specified in the standard.
     emva1288: dict[str, Emva1288] = {}
     #: Amplification at which flats and darks were recorded; `conversion_gain_dn_per_e` is given for 0 dB.
     gain_db: float | None = None
