@@ -227,8 +227,8 @@ def _number_of(error: BaseException) -> int | None:
     """Return the system's number of an error; pyserial keeps that of a refused lock in its text alone."""
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno
-    found = re.search(r"\[Errno (\d+)\]", str(error))
-    return int(found[1]) if found else None
+    match = re.search(r"\[Errno (\d+)\]", str(error))
+    return int(match[1]) if match else None
 
 
 class WireInstrument(Instrument):

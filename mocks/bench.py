@@ -54,7 +54,7 @@ from sim.frame import (
     Kept,
     KeptTransfers,
     SceneLight,
-    collected_electrons,
+    collect_electrons,
     dark_electrons,
     pair_gain_factor,
     read_electrons,
@@ -332,7 +332,7 @@ class Bench:
         )
         with self._camera_locks[side]:
             source *= unsteady_source(camera.model, camera.acting, exposure.elapsed_s)
-            held = collected_electrons(light, camera.model, exposure, camera.acting, source=source)
+            held = collect_electrons(light, camera.model, exposure, camera.acting, source=source)
             read, self._kept[side] = read_electrons(held, camera.model, exposure, camera.acting, self._kept[side])
             frame = sample_from(
                 read,

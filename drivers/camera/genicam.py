@@ -212,7 +212,7 @@ class GenicamCamera(StreamingCamera):
 
     def departures(self) -> tuple[str, ...]:
         with self._used():
-            return tuple(f"{told}: its codes aren't the converter's" for told in self._departures)
+            return tuple(f"{departure}: its codes aren't the converter's" for departure in self._departures)
 
     def sensor(self) -> SensorInfo:
         with self._used() as features:

@@ -175,7 +175,7 @@ class FrameStream:
         for side in self._sides:
             while side.trigger < self._settled:
                 self._receive(side)
-        late = self._missed()
+        late = self._find_missed()
         if late is not None:
             self._count_on(late, 1, f"{late.name}: it didn't hear a trigger; use a longer interval, and check its line")
         newest = max(side.trigger for side in self._sides)
@@ -228,7 +228,7 @@ class FrameStream:
             self._settled += 1
             self._given.popleft()
 
-    def _missed(self) -> _Side | None:
+    def _find_missed(self) -> _Side | None:
         """Return a wired camera whose frame began half an interval later than the others': it belongs to another
         trigger.
 
@@ -242,7 +242,7 @@ class FrameStream:
         if len(since) < 2:
             return None
         least_ns = min(since_ns for since_ns, _ in since)
-        most_ns, late = max(since, key=lambda one: one[0])
+        most_ns, late = max(since, key=lambda interval_and_side: interval_and_side[0])
         interval_ns = 1e9 * self._interval_s or least_ns
         return late if most_ns - least_ns > 0.5 * interval_ns else None
 

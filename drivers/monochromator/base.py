@@ -228,16 +228,16 @@ class HandSlits:
         return (f"{who}: its slits are set by hand, and no slit_um is stated: the bandwidth of its light isn't known",)
 
 
-def lines_per_mm(told: str, who: str) -> float:
+def lines_per_mm(text: str, who: str) -> float:
     """Lines per mm of the grating in use, of the answer `1,1200,VIS` to GRAT?. Raises `InstrumentError` for another
     answer."""
     try:
-        lines = float(told.split(",")[1])
+        lines = float(text.split(",")[1])
     except (IndexError, ValueError):
         lines = 0.0
     if not lines > 0.0:
         raise InstrumentError(
-            f"{who}: says {told!r} of its grating, which has no lines per mm; state dispersion_nm_per_mm in the "
+            f"{who}: says {text!r} of its grating, which has no lines per mm; state dispersion_nm_per_mm in the "
             "station file"
         )
     return lines

@@ -212,12 +212,12 @@ def traced_table(
 
     Raises InputError for a prescription that can't be read or traced, and for a folder that can't be written to.
     """
-    from sim.optics.traced_table import cached_table  # here, as compiled code takes a second to import
+    from sim.optics.traced_table import read_or_trace_table  # here, as compiled code takes a second to import
     from sim.optics.zmx import read_zmx
 
     folder = cache or lens_cache()
     try:
-        return cached_table(read_zmx(prescription), folder, progress=progress)
+        return read_or_trace_table(read_zmx(prescription), folder, progress=progress)
     except ValueError as error:
         raise InputError(_first(error)) from error
     except OSError as error:

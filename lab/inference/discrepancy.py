@@ -40,10 +40,10 @@ _SPECTRAL_STEP_NM, _SPECTRAL_CORRELATED, _MOST_SPECTRAL = 10.0, 1.5, 48
 _TRANSFER_NODES = (0.0, 0.01, 0.03, 0.06, 0.12, 0.2, 0.32, 0.46, 0.64, 0.82, 1.0)
 #: Nodes about the axis: what has two lobes, as a saddle, is followed to 5 % by lines.
 _ANGLES = 16
-#: The most nodes by time, at captures, and their correlation length; the most of each channel's.
-_MOST_TIMES, _TIMES_CORRELATED, _FEW_TIMES = 20, 4.0, 7
+#: The most nodes by time, at captures; at lit ones; of each channel's; and the correlation length, nodes.
+_MOST_TIMES, _MOST_LIT_TIMES, _FEW_TIMES, _TIMES_CORRELATED = 20, 64, 7, 8.0
 #: The most nodes by exposure.
-_MOST_EXPOSURES = 8
+_MOST_EXPOSURES = 16
 #: Codes after which a table of their widths repeats: the longest period of the combs that are counted.
 _CODES_PERIOD = 8
 #: Widths of the borders of a screen's cells at which their exponent varies, px.
@@ -327,7 +327,8 @@ def _on_state(model: MeasurementModel, base: FloatArray, curves: Iterator[StateC
         table = np.column_stack(own)
         if table.any():
             factor = np.asarray(np.linalg.cholesky(curve.kernel), float)
-            yield _Columns(table @ factor, factor, curve, max(MOST_COLUMNS, curve.period))
+            most = curve.nodes if curve.period or curve.may_jump else MOST_COLUMNS
+            yield _Columns(table @ factor, factor, curve, most)
 
 
 def _points(at: Sequence[float] | FloatArray) -> tuple[float, ...]:
@@ -393,23 +394,25 @@ def _response(dataset: Dataset) -> Iterator[StateCurve]:
         yield StateCurve("charge", "exposure", "mean", _points(at))
 
 
-def _times_s(dataset: Dataset) -> tuple[float, ...]:
-    times = sorted({dataset.elapsed_s(c) for c in dataset.recordings.captures(side=dataset.side)})
-    few = np.unique(np.linspace(0, len(times) - 1, _MOST_TIMES).round().astype(int))
+def _times_s(dataset: Dataset, most: int, kinds: Sequence[str | None] = (None,)) -> tuple[float, ...]:
+    """Return the times of captures of these kinds (None: all), so many of them at most."""
+    captures = (c for kind in kinds for c in dataset.recordings.captures(kind, dataset.side))
+    times = sorted({dataset.elapsed_s(c) for c in captures}) or [0.0]
+    few = np.unique(np.linspace(0, len(times) - 1, most).round().astype(int))
     return _points(np.array(times)[few]) if len(few) > 1 else (0.0, max(times[-1], 1.0))
 
 
 def _source(dataset: Dataset) -> Iterator[StateCurve]:
-    at = _times_s(dataset)
+    at = _times_s(dataset, _MOST_LIT_TIMES, ("flat", "narrowband"))
     yield StateCurve("light", "time", "mean", at, correlated=_TIMES_CORRELATED, may_jump=True)
     if len(dataset.channels) > 1:
-        few = at[:: max(len(at) // _FEW_TIMES, 1)]
+        few = _times_s(dataset, _FEW_TIMES, ("flat", "narrowband"))
         yield StateCurve("light", "plane x time", "mean", few, curves=len(dataset.channels))
 
 
 def _offset(dataset: Dataset) -> Iterator[StateCurve]:
     unit, corner_um = dataset.camera.read_noise_e, _corner_um(dataset)
-    at = _times_s(dataset)
+    at = _times_s(dataset, _MOST_TIMES)
     yield StateCurve("signal", "time", "mean", at, unit, correlated=_TIMES_CORRELATED, may_jump=True)
     yield StateCurve("signal", "radius", "mean", _points(np.linspace(0.0, corner_um, 4)), unit)
     yield StateCurve("signal", "row", "mean", _points(np.linspace(0.0, 1.0, 6)), unit)

@@ -53,25 +53,32 @@ def at_luminance(curve: Spectrum, wanted_cd_m2: float) -> Spectrum:
     return curve.scale(wanted_cd_m2 / has)
 
 
-def _added_illuminants() -> dict[str, Spectrum]:
+def _load_illuminants() -> dict[str, Spectrum]:
     """Return the illuminants of other packages, by name in small letters: entry points of `calibench.illuminants` that
     are spectra."""
-    found = {}
+    illuminants = {}
     for name, spectrum in extensions("illuminants"):
         if isinstance(spectrum, Spectrum):
-            found[name.lower()] = spectrum
+            illuminants[name.lower()] = spectrum
         else:
             refuse("illuminants", name, f"{spectrum!r} is no sim.spectrum.Spectrum")
-    return found
+    return illuminants
 
 
 def illuminant(name: str, luminance_cd_m2: float) -> Spectrum:
-    """Radiance (W sr^-1 m^-2 nm^-1) of a perfect white diffuser under a named illuminant (D65, A, FL2, LED-B1, ...), at
-    the given luminance. Raises ValueError that lists the names for one that isn't known.
+    """Compute the radiance of a perfect white diffuser under a named illuminant.
+
+    name : D65, A, FL2, LED-B1, ... (colour-science's), or an entry point of `calibench.illuminants`
+    luminance_cd_m2 : cd/m^2
+
+    Returns W sr^-1 m^-2 nm^-1. Raises ValueError that lists the names for one that isn't known.
+
+    >>> round(luminance_cd_m2(illuminant("D65", 100.0)), 6)
+    100.0
     """
     known = colour_science().SDS_ILLUMINANTS
     matching = {key.lower(): key for key in known}
-    added = _added_illuminants()
+    added = _load_illuminants()
     if name.lower() not in matching and name.lower() in added:
         return at_luminance(added[name.lower()], luminance_cd_m2)
     if name.lower() not in matching:
