@@ -306,9 +306,12 @@ def point_of(effect: Effect, camera: CameraModel) -> Point:
 
 
 def effect_at(point: Point, parameters: Sequence[EffectParameter]) -> Effect:
-    """Return the effect of a point: its template with the parameters of u."""
-    values = {p.name: p.to_value(float(u)) for p, u in zip(parameters, point.u, strict=True)}
+    """Return the effect of a point: its template with the parameters of u, itself at its own u. A value isn't bit for
+    bit that of its u, and would be predicted anew."""
     template: Effect = point.template
+    if all(p.to_u(float(getattr(template, p.name))) == u for p, u in zip(parameters, point.u, strict=True)):
+        return template
+    values = {p.name: p.to_value(float(u)) for p, u in zip(parameters, point.u, strict=True)}
     return template.replace_fields(**values)
 
 
