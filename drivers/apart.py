@@ -146,9 +146,6 @@ def _listen(answers: Any, heard: queue.SimpleQueue[tuple[str, Any] | None]) -> N
         heard.put(None)
 
 
-# --- in the process ---------------------------------------------------------------------------------------------------
-
-
 def _hear(requests: queue.SimpleQueue[Any]) -> None:
     with contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
         while True:

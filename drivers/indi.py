@@ -26,7 +26,7 @@ _PIECE = 1 << 20
 
 @dataclass
 class _Vector:
-    """A property as it was told last: its kind (`Switch`, `Number`, `Text`, `Light`, `BLOB`), state, and values.
+    """A property as it was reported last: its kind (`Switch`, `Number`, `Text`, `Light`, `BLOB`), state, and values.
 
     `updates`: how often it was told; `changes`: of these, as a new value. A server tells definitions to all clients
     when one of them asks.
@@ -224,7 +224,7 @@ class IndiDevice:
             self._await("CONNECTION", lambda: are_there() or not is_on())
 
     def await_number(self, name: str, element: str) -> None:
-        """Return once a number is above 0: some are told when it is connected, and are 0 before."""
+        """Return once a number is above 0: some are sent after the connection, and are 0 before."""
         self._await(name, lambda: self.number(name, element) > 0)
 
     def ask(self, name: str) -> None:
@@ -234,7 +234,7 @@ class IndiDevice:
         self._await(name, lambda: self._vector(name).updates > before)
 
     def get(self, name: str) -> Setting:
-        """Return a property's value as it was told last."""
+        """Return a property's last reported value."""
         vector = self._vector(name)
         if vector.kind == "Switch":
             return next((name for name, value in vector.values.items() if value == "On"), "")
@@ -274,7 +274,7 @@ class IndiDevice:
         self._refuse_alert(name)
 
     def catch_up(self) -> None:
-        """Take in what was told until now."""
+        """Process the messages that have come."""
         until = time.monotonic() + self._left_s()
         while self._pump(0.0) and time.monotonic() < until:
             continue
@@ -307,7 +307,7 @@ class IndiDevice:
         if name in self._vectors and self.state(name) == "Alert":
             message = " ".join(self._said.split())[-160:]
             raise InstrumentError(
-                f"{self._who}: it refuses {name} ({message or 'no reason told'}); look into its driver"
+                f"{self._who}: it refuses {name} ({message or 'no reason stated'}); look into its driver"
             )
 
     def execute(self, name: str) -> None:

@@ -36,7 +36,11 @@ _LONGEST_ANSWER = 1 << 20
 
 
 def shown(data: bytes) -> str:
-    """Bytes as one line of a message: printable ASCII unchanged, the rest escaped, cut at 60 characters."""
+    """Write bytes as one line of a message: printable ASCII unchanged, the rest escaped, cut at 60 characters.
+
+    >>> shown(bytes([79, 75, 13]))
+    "'OK\\\\r'"
+    """
     text = data.decode("latin-1").encode("unicode_escape").decode("ascii")
     return repr(data)[1:] if len(text) <= 60 else f"'{text[:57]}...'"
 

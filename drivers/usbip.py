@@ -60,9 +60,6 @@ _BUSY_ATTEMPTS, _BUSY_PAUSE_S = 5, 0.03
 _DEVICE_DESCRIPTOR, _CONFIGURATION, _STRING, _INTERFACE, _ENDPOINT = 1, 2, 3, 4, 5
 
 
-# --- descriptors ------------------------------------------------------------------------------------------------------
-
-
 @dataclass
 class Descriptor:
     """A descriptor's fields under pyusb's names."""
@@ -329,9 +326,6 @@ class PipeBackend(IBackend):  # type: ignore[misc]  # pyusb is untyped
             return len(came)
         dev_handle.submit(0x00, setup, data.tobytes(), 0, timeout)
         return size
-
-
-# --- the client -------------------------------------------------------------------------------------------------------
 
 
 @dataclass

@@ -33,7 +33,7 @@ from sim.sensor.defects import Defects, Jumps
 from sim.sensor.electrons import NEIGHBOURS, NO_MULTIPLICATION, Multiplication
 from sim.sensor.lines import LineGains, LineNoise
 from sim.sensor.particles import Particles
-from sim.sensor.reading_order import OrderedNoise
+from sim.sensor.reading_order import ReadOutNoise
 from sim.sensor.trails import Trails, read_combs
 from sim.spectrum import FloatArray
 
@@ -631,7 +631,7 @@ class Signal(State):
     exposure_offset_dn: tuple[Callable[[float], float], ...] = ()
     noise_e2: tuple[Callable[[float], float], ...] = ()
     lines: tuple[LineNoise, ...] = ()
-    reading_order: tuple[OrderedNoise, ...] = ()
+    reading_order: tuple[ReadOutNoise, ...] = ()
     telegraph: tuple[Jumps, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
     filters: tuple[FloatArray, ...] = ()
@@ -742,8 +742,14 @@ class Codes(State):
 
 
 def kernel_otf(kernel: FloatArray, fx_cy_per_px: FloatArray, fy_cy_per_px: FloatArray) -> FloatArray | ComplexArray:
-    """Transfer function sum_ij k_ij exp(-2 pi i (fx (j - c) + fy (i - c))) of a kernel (odd, odd); real where the
-    kernel is symmetric.
+    """Compute the transfer function sum_ij k_ij exp(-2 pi i (fx (j - c) + fy (i - c))) of a kernel.
+
+    kernel : (odd, odd); fx_cy_per_px, fy_cy_per_px : arrays that broadcast, cycles per px
+
+    Returns the transfer function, real where the kernel is symmetric.
+
+    >>> kernel_otf(np.array([[0.25, 0.5, 0.25]]), np.array([0.0, 0.5]), np.zeros(2)).tolist()  # cos^2(pi f)
+    [1.0, 0.0]
     """
     half = kernel.shape[0] // 2, kernel.shape[1] // 2
     even = np.array_equal(kernel, kernel[::-1, ::-1])

@@ -19,7 +19,7 @@ from sim.sensor.amplifiers import CoupledAmplifiers
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.lines import LineGains, LineNoise, Lines
 from sim.sensor.particles import Particles
-from sim.sensor.reading_order import OrderedNoise
+from sim.sensor.reading_order import ReadOutNoise
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, codes_of, image_of, light_of, signal_of
 
@@ -58,10 +58,17 @@ GOLDEN_RATIO = 0.5 * (np.sqrt(5.0) - 1.0)
 
 @cache
 def noise_values(points: int) -> FloatArray:
-    """Values of equal weight that stand for a normal variable of mean 0 and standard deviation 1, (points, values).
+    """Choose values of equal weight that stand for a normal variable of mean 0 and standard deviation 1 at each
+    point.
 
-    At each point, the quantiles (i + s) / k, i = 0..k - 1. The offset s differs from point to point by the golden
-    ratio, so that points whose levels are alike sample the distribution k x points times.
+    points : number of points
+
+    Returns (points, values): at each point the quantiles (i + s) / k, i = 0..k - 1. The offset s differs from point
+    to point by the golden ratio, so that points of similar levels sample the distribution k x points times.
+
+    >>> values = noise_values(4)
+    >>> abs(round(float(values.mean()), 9)), round(float(values.std()), 9)
+    (0.0, 1.0)
     """
     count = int(np.clip(NOISE_VALUES // points, LEAST_AT_A_POINT, MOST_AT_A_POINT))
     offset = (0.5 + GOLDEN_RATIO * np.arange(points)) % 1.0
@@ -512,7 +519,7 @@ class Uniform:
         return self._signal.lines
 
     @property
-    def reading_order(self) -> tuple[OrderedNoise, ...]:
+    def reading_order(self) -> tuple[ReadOutNoise, ...]:
         """Noise in the order in which pixels are read."""
         return self._signal.reading_order
 

@@ -116,8 +116,8 @@ class AlpacaCamera(SingleFrameCamera):
             features.set("gain", int(gain))
             if (set_gain := features.get("gain")) != int(gain):
                 raise InstrumentError(
-                    f"{self._who}: told a gain of {gain:g} it says {set_gain}; its driver counts otherwise: leave the "
-                    "gain at 0 dB without gain_db_per_unit"
+                    f"{self._who}: a gain of {gain:g} was set and {set_gain} is read; its driver counts otherwise: "
+                    "leave the gain at 0 dB without gain_db_per_unit"
                 )
         return exposure_s
 

@@ -177,7 +177,7 @@ class GenicamCamera(StreamingCamera):
         set_if_there(features, "TriggerSelector", "FrameStart")
         if not features.has("TriggerMode"):
             raise InstrumentError(
-                f"{self._who}: it has no TriggerMode, so that it can't be told when to expose; use a camera that can "
+                f"{self._who}: it has no TriggerMode, so that its exposures can't be triggered; use a camera whose can "
                 "be triggered"
             )
         features.set("TriggerMode", "On")

@@ -1,4 +1,4 @@
-"""What every GenICam camera is told before it may measure: nothing automatic, nothing that bends its codes, and which
+"""Settings of every GenICam camera before it may measure: nothing automatic, nothing that changes its codes, and which
 lines trigger.
 
 The names are those of EMVA's Standard Features Naming Convention (SFNC 2.7), and makers' own where they differ. The
@@ -77,7 +77,7 @@ class Neutral:
     `selector`: the feature that chooses which of several is meant; all of its entries are set, or those that begin as
     one of `entries`. `switch`: features that switch it off: where the camera has one, its own value doesn't matter.
     `must`: a camera on which it stays on is refused, as its frames can't be compared, or aren't proportional to light;
-    otherwise that is told, and belongs to its frames."""
+    otherwise that is reported, and stored with its frames."""
 
     name: str
     value: Setting

@@ -35,8 +35,15 @@ _EVENT_MS = 20
 
 
 def seconds(choice: str) -> float | None:
-    """Return the exposure time (s) that a choice means: `1/60`, `0.0100s`, `2.5`, `30"`; None for `Bulb`, `Auto` and
-    so on."""
+    """Read the exposure time that a choice of the camera means.
+
+    choice : `1/60`, `0.0100s`, `2.5`, `30"`
+
+    Returns s; None for `Bulb`, `Auto` and so on.
+
+    >>> seconds("1/50"), seconds("2.5"), seconds("Bulb")
+    (0.02, 2.5, None)
+    """
     fraction = re.fullmatch(r"(\d+(?:\.\d+)?)(?:/(\d+(?:\.\d+)?))?\s*(?:s|sec|\")?", choice.strip())
     if fraction is None:
         return None
@@ -326,4 +333,4 @@ class Gphoto2Camera(LibraryCamera):
         return settings
 
     def _abort(self) -> None:
-        """It can't be told to: what still comes is dropped before the next exposure."""
+        """It has no such command: files that still come are dropped before the next exposure."""

@@ -115,7 +115,9 @@ class IndiCamera(SingleFrameCamera):
         if gain is not None:
             features.set("CCD_GAIN", f"GAIN={gain:g}")
             if abs((set_gain := self._device.number("CCD_GAIN", "GAIN")) - gain) > 1e-6:
-                raise InstrumentError(f"{self._who}: told a gain of {gain:g} it says {set_gain:g}; ask for another")
+                raise InstrumentError(
+                    f"{self._who}: a gain of {gain:g} was set and {set_gain:g} is read; ask for another"
+                )
         return exposure_s
 
     def _expose(self, exposure_s: float) -> None:

@@ -263,7 +263,7 @@ class MicroManagerCamera(LibraryCamera):
         found_s = 1e-3 * float(features.get(EXPOSURE_MS))
         if abs(found_s - exposure_s) > _TOLERANCE * exposure_s:
             raise InstrumentError(
-                f"{self._who}: told to expose for {exposure_s:g} s it says {found_s:g} s; ask for a time that it has"
+                f"{self._who}: an exposure of {exposure_s:g} s was set and {found_s:g} s is read; choose another"
             )
         return found_s
 

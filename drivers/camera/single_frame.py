@@ -1,4 +1,4 @@
-"""What cameras have in common that are told to expose once and asked for the picture: Micro-Manager's, ASCOM's, INDI's,
+"""Cameras that expose once on a command, and whose picture is then fetched: Micro-Manager's, ASCOM's, INDI's,
 gphoto2's.
 
 What reaches the camera says how each step is done. In which order, until when, and what is restored is here.

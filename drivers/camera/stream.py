@@ -24,9 +24,12 @@ _LAST_OF_16_BIT = 0xFFFF
 
 
 def frames_between(before: int, now: int) -> int:
-    """Return how many frames were numbered between two; below 0 for one that comes out of order.
+    """Count the frames that were numbered between two; below 0 for one that comes out of order.
 
-    GigE Vision's 16-bit numbers go from 65535 to 1; a camera that doesn't count says 0.
+    before, now : frame numbers. GigE Vision's 16-bit numbers go from 65535 to 1; a camera that doesn't count says 0
+
+    >>> frames_between(3, 4), frames_between(65535, 1), frames_between(4, 3)
+    (0, 0, -2)
     """
     if before == now == 0:
         return 0
@@ -47,7 +50,7 @@ class _Side:
     frame: Frame | None = field(default=None, repr=False)  # of `trigger`; None: taken, or torn
 
     def since_ns(self) -> int | None:
-        """Time on its own clock from the pair before to its frame; None where the clock isn't told."""
+        """Time on its own clock from the pair before to its frame; None where the camera doesn't report it."""
         if self.frame is None or self.frame.camera_time_ns is None or self.matched_ns is None:
             return None
         return self.frame.camera_time_ns - self.matched_ns

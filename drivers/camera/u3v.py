@@ -73,7 +73,7 @@ _WAIT_S = 1.0
 
 @dataclass(frozen=True)
 class StreamLayout:
-    """The transfers of one frame (bytes), as the stream's registers (SIRM) were told."""
+    """The transfers of one frame (bytes), as the stream's registers (SIRM) were set."""
 
     leader_bytes: int
     trailer_bytes: int

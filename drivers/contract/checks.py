@@ -76,9 +76,6 @@ def check_driver(family: str, name: str, peer: Peer) -> Iterator[Outcome]:
             yield Outcome(asks, "met")
 
 
-# --- the checks -------------------------------------------------------------------------------------------------------
-
-
 def _identify(subject: _Subject) -> None:
     driver = subject.make()
     driver.close()  # touches nothing, raises nothing
@@ -213,9 +210,6 @@ _CHECKS: dict[str, Callable[[_Subject], None]] = {
     "stops in the middle of what takes long": _stop,
     "serves two threads, and survives a second driver": _two_at_once,
 }
-
-
-# --- how calls end ----------------------------------------------------------------------------------------------------
 
 
 def _run_bounded(call: Callable[[], object], limit_s: float) -> None:

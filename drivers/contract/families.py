@@ -88,11 +88,11 @@ class MonochromatorContract(FamilyContract):
         require(driver.wavelength_nm() <= 0.5, "a refused wavelength moved it")
         for opened in (False, True, False):
             (driver.open_shutter if opened else driver.close_shutter)()
-            require(driver.shutter_is_open() is opened, f"the shutter told to be open = {opened} isn't")
+            require(driver.shutter_is_open() is opened, f"the shutter was set to open = {opened} and isn't")
         before = driver.slit_um()
         driver.check_slit_um(500.0)
         driver.set_slit_um(500.0)
-        require(abs(driver.slit_um() - 500.0) <= 5.0, f"told a slit of 500 um it has {driver.slit_um()} um")
+        require(abs(driver.slit_um() - 500.0) <= 5.0, f"a slit of 500 um was set and {driver.slit_um()} um is read")
         require(driver.bandwidth_nm() > 0.0, "its bandwidth isn't above 0")
         driver.set_slit_um(before)
         for wrong_um in (-1.0, 1e9):
@@ -169,7 +169,7 @@ class CameraContract(FamilyContract):
             frame = driver.capture()
             require(
                 abs(frame.exposure_s - exposure_s) <= 0.1 * exposure_s,
-                f"told {exposure_s} s the frame says {frame.exposure_s} s",
+                f"an exposure of {exposure_s} s was set and the frame states {frame.exposure_s} s",
             )
         before = driver.capture().frame_id
         require(driver.capture().frame_id == before + 1, "the frames' numbers don't go up by 1")
@@ -207,7 +207,7 @@ class StageContract(FamilyContract):
     def settings(self, driver: Stage) -> None:
         for name in self._targets(driver)[:3]:
             driver.place(name)
-            require(driver.placed() == name, f"told to place {name} it says {driver.placed()!r}")
+            require(driver.placed() == name, f"{name} was asked for and {driver.placed()!r} is read")
         if driver.targets():
             require_refused(lambda: driver.place("no-such-target"), "a target that isn't there")
 
@@ -267,7 +267,7 @@ class LightSourceContract(FamilyContract):
             for level in (1.0, 0.5, 0.0):
                 driver.set_level(level, channel)
                 read_level = driver.level(channel)
-                require(abs(read_level - level) <= 0.05, f"told to be lit at {level} it says {read_level}")
+                require(abs(read_level - level) <= 0.05, f"a level of {level} was set and {read_level} is read")
         for wrong in (-0.1, 1.1, math.nan):
             require_refused(lambda wrong=wrong: driver.set_level(wrong), f"a level of {wrong}")  # type: ignore[misc]
         require_refused(lambda: driver.set_level(0.5, "no-such-channel"), "a channel that isn't there")

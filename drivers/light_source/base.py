@@ -36,7 +36,7 @@ class LightSource(Instrument):
 
 
 class SteppedLamp(LightSource):
-    """A lamp of one channel with whole steps of brightness, told so and asked for it by whatever reaches it.
+    """A lamp of one channel with whole steps of brightness, set and read back by its protocol.
 
     `timeout_s`: longest time for an answer; `settle_s`: longest time until it is steady.
     """
@@ -133,7 +133,7 @@ class SteppedLamp(LightSource):
                 raise Interrupted(f"{self._who}: stopped while it settles; start again")
             self._until = time.monotonic() + self._timeout_s
         if (reading := self._read()) != step:
-            raise InstrumentError(f"{self._who}: told to go to step {step:g} it says {reading:g}; look at it")
+            raise InstrumentError(f"{self._who}: it was set to step {step:g} and reads {reading:g}; check the lamp")
 
     def _restore(self, kept: FoundSettings) -> None:
         if "step" in kept:

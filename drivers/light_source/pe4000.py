@@ -208,7 +208,8 @@ class Pe4000(WireInstrument, LightSource):
         for letter, state in wanted.items():
             if states[letter] != state:
                 raise InstrumentError(
-                    f"{self._transport.name}: told {letter}{state} channel {letter} says {states[letter]}; look at it"
+                    f"{self._transport.name}: channel {letter} was set to {letter}{state} and reads {states[letter]}; "
+                    "check the lamp"
                 )
 
     def _load(self, letter: str, led: str) -> None:

@@ -33,7 +33,7 @@ _PIECE = 4096
 #: A reading or the number of an error: no identity begins so, a late answer to what was asked before does.
 _NUMBER = re.compile(r"\s*[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\s*[^\W\d]{0,5}\s*(?:,|$)")
 _MOST_LATE = 3
-#: How long (s) a meter that has told its identity is silent, unless it tells it again to a connection before.
+#: How long (s) a meter is silent after its identity, unless it repeats it to an earlier connection.
 _QUIET_S = 0.1
 #: What sets a meter to direct current, by what its identity holds; the last one is every other meter's.
 _SETUP: tuple[tuple[str, tuple[str, ...]], ...] = (

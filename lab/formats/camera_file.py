@@ -69,9 +69,6 @@ class CameraFile:
     remarks: tuple[str, ...] = field(default=(), compare=False)
 
 
-# --- reading ----------------------------------------------------------------------------------------------------------
-
-
 def read_camera(
     file: Path,
     cache: Path | None = None,
@@ -303,9 +300,6 @@ def _first(error: Exception) -> str:
     return " ".join(text.split())
 
 
-# --- writing ----------------------------------------------------------------------------------------------------------
-
-
 def write_camera(file: Path, content: CameraFile) -> None:
     """Write a camera file that `read_camera` reads back to exactly the same camera.
 
@@ -442,9 +436,6 @@ def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> Camer
             std[key] = float(value)
     remarks = remarks_on_values(recordings.camera(side), fit, model)
     return CameraFile(f"{recordings.manifest.name} {side}", model.model_copy(update={"std": std}), remarks=remarks)
-
-
-# --- the camera without a file ----------------------------------------------------------------------------------------
 
 
 def default_camera() -> CameraFile:

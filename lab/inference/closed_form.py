@@ -293,15 +293,18 @@ class HealthyDraws:
         groups, draws, at = self.scales.groups, self.projected.shape[1], len(self.scales.gram)
         middle = np.array([float(g.everyday_quantile(np.array(0.5))) for g in groups])
         flips = [np.zeros(draws)]
+        more_prior = self.scales.prior_log[1] - self.scales.prior_log[0]
+        for g, values in self.scales.profiles_of_processes(middle, self.projected[:at]):
+            flips.append(logsumexp(values + np.log(groups[g].shares(True))[:, None], axis=0) + more_prior[g])
         for g, group in enumerate(groups):
-            if not group.may_be_unlisted:
+            if not group.may_be_unlisted or not group.varies(False):
                 continue
             points = [group.scales(u) for u in (False, True)]
             values = self.scales.profiles(g, middle, np.concatenate(points), self.projected[:at])
             values += np.log(np.concatenate([group.shares(u) for u in (False, True)]))[:, None]
             usual, other = np.split(values, [len(points[0])])
             more = logsumexp(other, axis=0) - logsumexp(usual, axis=0)
-            flips.append(more + self.scales.prior_log[1, g] - self.scales.prior_log[0, g])
+            flips.append(more + more_prior[g])
         gains = gains_of(self._odds(middle, signatures), hypotheses, signatures)
         return 1.0 / (np.exp(logsumexp(flips, axis=0)) + others_over_empty(gains, prior))
 

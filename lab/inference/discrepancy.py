@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal, get_args
 
 import numpy as np
@@ -38,10 +39,12 @@ _NODES_CORRELATED = 2.0
 _SPECTRAL_STEP_NM, _SPECTRAL_CORRELATED, _MOST_SPECTRAL = 10.0, 1.5, 48
 #: Nodes of the transfer function, cycles a pixel: closer towards 0, where a halo of some pixels acts.
 _TRANSFER_NODES = (0.0, 0.01, 0.03, 0.06, 0.12, 0.2, 0.32, 0.46, 0.64, 0.82, 1.0)
+#: Nodes by radius: lines between them follow a parabola to 0.4 % of its height.
+_RADII = 9
 #: Nodes about the axis: what has two lobes, as a saddle, is followed to 5 % by lines.
 _ANGLES = 16
-#: The most nodes by time, at captures; at lit ones; of each channel's; and the correlation length, nodes.
-_MOST_TIMES, _MOST_LIT_TIMES, _FEW_TIMES, _TIMES_CORRELATED = 20, 64, 7, 8.0
+#: The most nodes by time, at captures; of each channel's; and the most captures between which a step is tried.
+_MOST_TIMES, _FEW_TIMES, _MOST_STEPS = 12, 7, 33
 #: The most nodes by exposure.
 _MOST_EXPOSURES = 16
 #: Codes after which a table of their widths repeats: the longest period of the combs that are counted.
@@ -241,12 +244,16 @@ class StateCurve:
     fixed: int = 0
     curves: int = 1
     correlated: float = _NODES_CORRELATED
-    may_jump: bool = False  # Ornstein and Uhlenbeck's process in the place of a smooth one
 
     @property
     def nodes(self) -> int:
         """Number of values."""
         return self.period or self.curves * (len(self.at) - self.fixed - self.is_closed)
+
+    @property
+    def is_step(self) -> bool:
+        """Whether it changes once, between two points."""
+        return self.fixed == 1 and len(self.at) == 2
 
     @property
     def is_closed(self) -> bool:
@@ -269,8 +276,7 @@ class StateCurve:
         apart = np.abs(x[:, None] - x)
         if self.is_closed:  # the chord, so that the kernel is positive definite
             apart = len(x) / np.pi * np.sin(np.pi * apart / len(x))
-        fall = apart / self.correlated if self.may_jump else 0.5 * np.square(apart / self.correlated)
-        own = np.exp(-fall) + 1e-6 * np.eye(len(x))
+        own = np.exp(-0.5 * np.square(apart / self.correlated)) + 1e-6 * np.eye(len(x))
         return np.kron(np.eye(self.curves), own)
 
     def change(self, values: FloatArray) -> FloatArray:
@@ -327,8 +333,7 @@ def _on_state(model: MeasurementModel, base: FloatArray, curves: Iterator[StateC
         table = np.column_stack(own)
         if table.any():
             factor = np.asarray(np.linalg.cholesky(curve.kernel), float)
-            most = curve.nodes if curve.period or curve.may_jump else MOST_COLUMNS
-            yield _Columns(table @ factor, factor, curve, most)
+            yield _Columns(table @ factor, factor, curve, max(MOST_COLUMNS, curve.period))
 
 
 def _points(at: Sequence[float] | FloatArray) -> tuple[float, ...]:
@@ -349,11 +354,11 @@ def _transfer(dataset: Dataset) -> Iterator[StateCurve]:
 
 def _field(dataset: Dataset) -> Iterator[StateCurve]:
     corner_um = _corner_um(dataset)
-    yield StateCurve("image", "radius", "mean", _points(np.linspace(0.0, corner_um, 5)))
+    yield StateCurve("image", "radius", "mean", _points(np.linspace(0.0, corner_um, _RADII)))
     yield StateCurve("image", "angle", "mean", _points(np.linspace(0.0, 360.0, _ANGLES + 1)))
     exposures = _exposures_s(dataset, ("flat",))
     if exposures:
-        at = _points(np.linspace(0.0, corner_um, 5))
+        at = _points(np.linspace(0.0, corner_um, _RADII))
         yield StateCurve("charge", "radius x exposure", "mean", at, unit=exposures[0])
 
 
@@ -402,26 +407,33 @@ def _times_s(dataset: Dataset, most: int, kinds: Sequence[str | None] = (None,))
     return _points(np.array(times)[few]) if len(few) > 1 else (0.0, max(times[-1], 1.0))
 
 
+def _steps(stage: Stage, at: Sequence[float], unit: float = 1.0) -> Iterator[StateCurve]:
+    """Yield a step in time between each two of some captures: a process of one value."""
+    for before, after in pairwise(at):
+        yield StateCurve(stage, "time", "mean", (before, after), unit, fixed=1)
+
+
 def _source(dataset: Dataset) -> Iterator[StateCurve]:
-    at = _times_s(dataset, _MOST_LIT_TIMES, ("flat", "narrowband"))
-    yield StateCurve("light", "time", "mean", at, correlated=_TIMES_CORRELATED, may_jump=True)
+    lit = ("flat", "narrowband")
+    yield StateCurve("light", "time", "mean", _times_s(dataset, _MOST_TIMES, lit))
+    yield from _steps("light", _times_s(dataset, _MOST_STEPS, lit))
     if len(dataset.channels) > 1:
-        few = _times_s(dataset, _FEW_TIMES, ("flat", "narrowband"))
-        yield StateCurve("light", "plane x time", "mean", few, curves=len(dataset.channels))
+        at = _times_s(dataset, _FEW_TIMES, lit)
+        yield StateCurve("light", "plane x time", "mean", at, curves=len(dataset.channels))
 
 
 def _offset(dataset: Dataset) -> Iterator[StateCurve]:
     unit, corner_um = dataset.camera.read_noise_e, _corner_um(dataset)
-    at = _times_s(dataset, _MOST_TIMES)
-    yield StateCurve("signal", "time", "mean", at, unit, correlated=_TIMES_CORRELATED, may_jump=True)
-    yield StateCurve("signal", "radius", "mean", _points(np.linspace(0.0, corner_um, 4)), unit)
+    yield StateCurve("signal", "time", "mean", _times_s(dataset, _MOST_TIMES), unit)
+    yield from _steps("signal", _times_s(dataset, _MOST_STEPS), unit)
+    yield StateCurve("signal", "radius", "mean", _points(np.linspace(0.0, corner_um, _RADII)), unit)
     yield StateCurve("signal", "row", "mean", _points(np.linspace(0.0, 1.0, 6)), unit)
     yield StateCurve("signal", "column", "mean", _points(np.linspace(0.0, 1.0, 6)), unit)
     exposures = _exposures_s(dataset, ("dark", "flat"))
     if len(exposures) > 2:
         few = np.unique(np.linspace(0, len(exposures) - 1, _MOST_EXPOSURES).round().astype(int))
         yield StateCurve("signal", "exposure", "mean", _points(np.array(exposures)[few]), unit)
-        at = _points(np.linspace(0.0, corner_um, 4))
+        at = _points(np.linspace(0.0, corner_um, _RADII))
         yield StateCurve("charge", "radius", "mean", at, unit / exposures[-1])
 
 

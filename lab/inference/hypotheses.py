@@ -144,8 +144,8 @@ class Hypothesis:
 # --- The prior of sets ------------------------------------------------------------------------------------------------
 
 #: Probabilities of 0, 1, 2, ... active hypotheses on a side: half of the cameras do as their data sheet says; of the
-#: others each further cause is two and a half times rarer.
-NUMBER = (0.5, 0.3, 0.12, 0.05, 0.02, 0.01)
+#: others each further cause is two to three times rarer. A camera that is looked at closely shows more than five.
+NUMBER = (0.5, 0.3, 0.12, 0.05, 0.02, 0.006, 0.0025, 0.001, 0.0005)
 
 
 @dataclass(frozen=True)

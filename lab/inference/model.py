@@ -13,7 +13,7 @@ cameras: `camera.py` binds it to a recording set, a test to a toy."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -295,6 +295,30 @@ class ScaleIntegral:
         t2 = np.square(points)[:, None]
         return np.asarray(total + 0.5 * ((t2 / (1.0 + t2 * size)) @ power - np.log1p(t2 * size).sum(1)[:, None]))
 
+    def profiles_of_processes(self, tau: FloatArray, projected: FloatArray) -> Iterator[tuple[int, FloatArray]]:
+        """Yield each group that is there only where it is unlisted, with its gain of log marginal likelihood at the
+        points of its scale (k, m) for m residuals, given their W'r (R + p, m) and the scales of the others: one
+        factorisation for all."""
+        which = [g for g, group in enumerate(self.groups) if group.may_be_unlisted and not group.varies(False)]
+        amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
+        there = np.flatnonzero(amplitude)
+        scale, split = amplitude[there], len(amplitude) - len(self.precision)
+        inner = scale[:, None] * self.gram[np.ix_(there, there)] * scale
+        inner[np.diag_indices_from(inner)] += np.concatenate([np.ones(split), self.precision])[there]
+        factor = cho_factor(inner, lower=True, check_finite=False) if len(there) else None
+        right = np.zeros((0, projected.shape[1]))
+        if factor is not None:
+            right = cho_solve(factor, scale[:, None] * projected[there], check_finite=False)
+        ends = np.cumsum(self.group_sizes)
+        for g in which:
+            own = np.arange(ends[g] - self.group_sizes[g], ends[g])
+            across = scale[:, None] * self.gram[np.ix_(there, own)]
+            left = across if factor is None else cho_solve(factor, across, check_finite=False)
+            size, vectors = eigh(self.gram[np.ix_(own, own)] - across.T @ left)
+            size, power = np.maximum(size, 0.0), np.square(vectors.T @ (projected[own] - across.T @ right))
+            t2 = np.square(self.groups[g].scales(True))[:, None]
+            yield g, 0.5 * ((t2 / (1.0 + t2 * size)) @ power - np.log1p(t2 * size).sum(1)[:, None])
+
     def _swept(self, tau: FloatArray, which: Iterable[int], unlisted: frozenset[int]) -> FloatArray:
         """Return the scales with each of `which` moved to its likeliest point, the others as they are."""
         tau = tau.copy()
@@ -338,10 +362,11 @@ class ScaleIntegral:
         others as without: a lower bound of the gain."""
         tau, flips = self.everyday_mode, dict[int, float]()
         at = everyday = self.log_likelihood(tau)
-        for g, group in enumerate(self.groups):
+        for g, gains in self.profiles_of_processes(tau, self.projected[:, None]):
+            flips[g] = log_mean(gains[:, 0], self.groups[g].shares(True))
+        for g in self._everyday_groups:
+            group = self.groups[g]
             usual, other = group.scales(False), group.scales(True) if group.may_be_unlisted else np.zeros(0)
-            if len(usual) + len(other) == 1:
-                continue
             values = self.profile(g, tau, np.concatenate([usual, other]))
             usual_log = log_mean(values[: len(usual)], group.shares(False))
             everyday += usual_log - at

@@ -49,7 +49,11 @@ def _why_refused(name: str, kind: object, known: Collection[str]) -> str | None:
 
 
 def effect(name: str) -> type[Effect]:
-    """Return the effect of that name; raises KeyError that lists the names there are."""
+    """Return the effect of a name. Raises KeyError that lists the names.
+
+    >>> effect("defocus").__name__
+    'Defocus'
+    """
     known = effects()
     if name not in known:
         raise KeyError(f"no effect named {name!r}; there are: {', '.join(known)}")
@@ -58,7 +62,11 @@ def effect(name: str) -> type[Effect]:
 
 @cache
 def members(family: Family) -> tuple[str, ...]:
-    """Names of the effects of a family that a diagnosis looks for."""
+    """List the names of the effects of a family that a diagnosis looks for.
+
+    >>> "row_noise" in members(effect("row_noise").family)
+    True
+    """
     return tuple(kind.name for kind in candidates() if kind.family is family)
 
 

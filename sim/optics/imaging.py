@@ -357,9 +357,6 @@ Imaging = Annotated[
 ]
 
 
-# --- samples ---------------------------------------------------------------------------------------------------------
-
-
 def _check_wavelengths(wavelength_nm: tuple[float, ...], *, empty: bool = False) -> None:
     if not wavelength_nm and not empty:
         raise ValueError("no wavelength is given: give at least one, in nm")

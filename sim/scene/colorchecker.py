@@ -28,7 +28,11 @@ FRAME_REFLECTANCE = Spectrum(wavelength_nm=(200.0, 1200.0), value=(0.03, 0.03))
 
 
 def grid(chart: str = "ColorChecker24") -> tuple[int, int]:
-    """Rows and columns of a chart's patches. Raises ValueError for a chart that isn't known."""
+    """Return the numbers of rows and columns of a chart's patches. Raises ValueError for a chart that isn't known.
+
+    >>> grid("ColorChecker24")
+    (4, 6)
+    """
     known = {"ColorChecker24": GRID, "ColorCheckerSG": GRID_SG}
     if chart not in known:
         raise ValueError(

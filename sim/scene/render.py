@@ -114,10 +114,16 @@ def draw(scene: Scene, grid: Grid) -> Drawing:
 
 
 def half_plane(distance: FloatArray, slope_x: FloatArray | float, slope_y: FloatArray | float) -> FloatArray:
-    """Share of unit squares on the positive side of the line g = 0, exactly.
+    """Compute the share of unit squares on the positive side of the line g = 0, exactly: the distribution function
+    of the sum of two uniform variables of widths |slope_x| and |slope_y|.
 
-    `distance` is g at the squares' centres, g = distance + slope_x x + slope_y y with x, y in -1/2..1/2. The share is
-    the distribution function of the sum of two uniform variables of widths a = |slope_x|, b = |slope_y|.
+    distance : g at the squares' centres; slope_x, slope_y : of g = distance + slope_x x + slope_y y, x and y in
+        -1/2..1/2
+
+    Returns the share, 0..1, of the shape of `distance`.
+
+    >>> half_plane(np.array([-1.0, 0.0, 0.25, 1.0]), 1.0, 0.0).round(6).tolist()
+    [0.0, 0.5, 0.75, 1.0]
     """
     a, b = np.abs(slope_x), np.abs(slope_y)
     far = np.broadcast_to(0.5 * (a + b), np.shape(distance))

@@ -47,7 +47,11 @@ def phases(cfa: Cfa) -> dict[str, list[tuple[int, int]]]:
 
 
 def first_pixels(cfa: Cfa) -> dict[str, tuple[int, int]]:
-    """Return where the first pixel (row, column) of each plane of a mosaic is, by the names that `planes` has."""
+    """Return the first pixel (row, column) of each plane of a mosaic, by the names that `planes` has.
+
+    >>> first_pixels("GRBG")
+    {'R': (0, 1), 'G1': (0, 0), 'G2': (1, 1), 'B': (1, 0)}
+    """
     if cfa == "MONO":
         return {"Y": (0, 0)}
     at = phases(cfa)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from sim.sensor.alternating_rows import AlternatingRows
 from sim.spectrum import FloatArray
 
 #: Pixels that are drawn for each one that is read: the ends of a frame have nothing in common.
@@ -125,6 +126,10 @@ class OrderedNoise:
         """Mean covariance of pixels in one row that are `apart` columns apart, or, `turned`, as far from a border on
         either side, 1 to `apart` columns; after the means of rows and columns were taken out of each plane."""
         return float(self._mixed(_departures_apart(self._shape, shape, period, apart, turned)))
+
+
+#: Noise of the read-out that depends on the place of a pixel in the order in which pixels are read.
+ReadOutNoise = OrderedNoise | AlternatingRows
 
 
 # Responses (2, ...) to the common and to the alternating noise of 1 e. A fit moves both sizes much more often than the

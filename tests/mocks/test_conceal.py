@@ -71,6 +71,7 @@ class Case:
 
 CASES = (
     Case("left:adc_nonlinearity:error_dn=40", (replace(FLAT, exposure_s=0.004),)),
+    Case("left:alternating_row_noise:noise_e=6", (DARK,), tolerance=0.4),
     Case("both:ambient_light:rate_e_per_s=100000,red_over_blue=3", (FLAT, replace(FLAT, light=LightSettings()))),
     Case("left:amplifier_crosstalk:share_percent=4,excess_percent=3,pedestal_e=200", (FLAT, DARK)),
     Case("left:amplifier_glow:glow_e_per_s=300,reach_mm=0.2,corner=bottom_left", (DARK,)),

@@ -67,14 +67,16 @@ class _Shown:
         """Standard deviations at the nodes (k,)."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
-    @property
-    def steepest(self) -> tuple[int, int, float, float]:
-        """The two nodes whose difference is the most standard deviations, the higher first, that difference and its
-        standard deviation. A level that all nodes share may be undetermined, as a gain takes it up."""
-        variance = np.diag(self.covariance)
-        std = np.sqrt(np.maximum(variance[:, None] + variance - 2.0 * self.covariance, 1e-12 * variance.max()))
-        apart = self.mean[:, None] - self.mean
-        i, j = divmod(int(np.argmax(apart / std)), len(self.mean))
+    def steepest(self, fixed: int) -> tuple[int, int, float, float]:
+        """The two points whose difference is the most standard deviations, the higher first, that difference and its
+        standard deviation; the values of the first `fixed` points are none. A level that all points share may be
+        undetermined, as a gain takes it up."""
+        mean = np.concatenate([np.zeros(fixed), self.mean])
+        covariance = np.pad(self.covariance, ((fixed, 0), (fixed, 0)))
+        variance = np.diag(covariance)
+        std = np.sqrt(np.maximum(variance[:, None] + variance - 2.0 * covariance, 1e-12 * variance.max()))
+        apart = mean[:, None] - mean
+        i, j = divmod(int(np.argmax(apart / std)), len(mean))
         return i, j, float(apart[i, j]), float(std[i, j])
 
 
@@ -145,7 +147,7 @@ def _law(reading: SideTable, group: int, delta: Delta, probability: float, other
     curve = shown.process.curve
     one = _of_state(reading, curve, shown) if isinstance(curve, StateCurve) else _of_observable(curve, shown)
     before, after, n = _chi2_of(reading, shown, judged)
-    form = "periodic" if one.period else "curve"
+    form = "periodic" if one.period else "step" if isinstance(curve, StateCurve) and curve.is_step else "curve"
     told = DiscoveredLaw(
         side=reading.side,
         stage=one.stage,
@@ -172,7 +174,9 @@ def _law(reading: SideTable, group: int, delta: Delta, probability: float, other
         curve_of=one.curve_of,
         labels=one.labels,
     )
-    said = _statement(told, one.size, [_axis(reading, g) for g in others], is_held_out=judged is not None)
+    said = _statement(
+        told, one.size, list(dict.fromkeys(_axis(reading, g) for g in others)), is_held_out=judged is not None
+    )
     is_of_camera = isinstance(curve, StateCurve) and not isinstance(curve, BordersCurve)
     return Law(group, told.model_copy(update={"statement": said}), curve.law(shown.mean) if is_of_camera else None)
 
@@ -249,12 +253,12 @@ def _size_of_state(
     curve: StateCurve, shown: _Shown, factor: float, unit: str, channels: Sequence[str]
 ) -> str:  # fmt: skip
     """Say by how much a law differs between the two nodes that are known best against each other."""
-    i, j, apart, std = shown.steepest
+    i, j, apart, std = shown.steepest(curve.fixed)
     scale, said = (100.0, "%") if unit == "%" else (factor, unit)
     size = f"{scale * curve.unit * apart:.3g} ± {scale * curve.unit * std:.1g} {said}"
     if curve.period:
         return f"repeats every {curve.period}, {curve.along} {i} {size} above {curve.along} {j}"
-    at, of = coordinate_unit(curve.stage, curve.along, curve.of), curve.at[curve.fixed :]
+    at, of = coordinate_unit(curve.stage, curve.along, curve.of), curve.at
     high, low = (
         f"{of[k % len(of)]:.4g} {at}".strip() + (f" in {channels[k // len(of)]}" if curve.curves > 1 else "")
         for k in (i, j)

@@ -8,7 +8,7 @@ import pytest
 from lab.inference.delta import condition
 from lab.inference.discrepancy import StateCurve
 from lab.inference.hypotheses import SetPrior
-from lab.inference.model import Group, Process, with_columns
+from lab.inference.model import Group, Process, ScaleIntegral, with_columns
 from lab.inference.posterior import read_table
 from lab.inference.search import Search
 from lab.observables.gaussian import BlockCovariance, Gaussian
@@ -97,6 +97,28 @@ def test_unlisted_physics_counts_beside_what_says_nothing() -> None:
     assert posterior.probability("unlisted", "curve") == pytest.approx(expected, abs=0.005)
 
 
+@pytest.mark.parametrize("everyday", [True, False])
+def test_flips_of_processes_are_those_of_the_whole_likelihood(everyday: bool) -> None:
+    """A state with something everyday and two processes: what a process gains by its scale is the change of the log
+    marginal likelihood, to rounding. The prior of none is that of none on any state."""
+    rng, one = np.random.default_rng(7), _group()
+    processes = tuple(Group("curve", rng.standard_normal((NUMBERS, k)), 0.0, least=0.03, largest=2.0) for k in (1, 4))
+    groups = (Group("curve", one.columns, 0.01, largest=0.0), *processes) if everyday else processes
+    bare = Gaussian(np.zeros(NUMBERS), (BlockCovariance(np.eye(NUMBERS)),), np.ones((NUMBERS, 1)))
+    value, none = 3.0 * rng.standard_normal(NUMBERS), np.zeros(0)
+    scales = ScaleIntegral.of(bare, value, groups, np.zeros((NUMBERS, 0)), none, none, 0.05)
+    tau = scales.everyday_mode
+    found = dict(scales.profiles_of_processes(tau, scales.projected[:, None]))
+    assert set(found) == {g for g, group in enumerate(groups) if group.may_be_unlisted}
+    for g, gains in found.items():
+        points = groups[g].scales(True)
+        expected = scales.profile(g, tau, points) - scales.log_likelihood(tau)
+        np.testing.assert_allclose(gains[:, 0], expected, atol=1e-8)
+        assert scales.mode(frozenset((g,)))[g] in points
+    assert scales.log_prior(frozenset()) == pytest.approx(np.log(0.95))
+    assert np.exp(scales.prior_log[1]).sum() == pytest.approx(0.05)
+
+
 @pytest.mark.parametrize(
     "curve",
     [
@@ -105,10 +127,11 @@ def test_unlisted_physics_counts_beside_what_says_nothing() -> None:
         StateCurve("image", "frequency", "mean", (0.0, 0.1, 0.2), fixed=1),
         StateCurve("light", "plane x time", "mean", (0.0, 60.0), curves=3),
         StateCurve("signal", "exposure", "mean", (0.001, 0.01, 0.1), unit=2.5),
+        StateCurve("light", "time", "mean", (60.0, 80.0), fixed=1),
         StateCurve("charge", "row", "mean", (), period=6),
         StateCurve("codes", "code", "mean", (), period=8),
     ],
-    ids=lambda curve: curve.along,
+    ids=lambda curve: f"{curve.along}{'-step' * curve.is_step}",
 )
 def test_a_law_has_the_values_of_its_process(curve: StateCurve) -> None:
     """Values of none change nothing; others stand at the law's points as departures in its unit. A table's mean is that
