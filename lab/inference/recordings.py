@@ -263,12 +263,10 @@ def hypotheses_of(measured: MeasurementModel) -> dict[str, Hypothesis]:
         if not measured.affected(kind).any():
             continue
         one = hypothesis_of(kind, measured.camera)
-        shown = [
-            float(np.linalg.norm(gaussian.whiten(measured.mean((point.template,)) - base))) * scale
-            for alternative in one.alternatives
-            for point, scale in zip(alternative.points, alternative.scales, strict=True)
-        ]
-        if max(shown) > LEAST_SHOWN:
+        changes = [measured.mean((p.template,)) - base for alternative in one.alternatives for p in alternative.points]
+        scales = [scale for alternative in one.alternatives for scale in alternative.scales]
+        shown = np.linalg.norm(gaussian.whiten(np.column_stack(changes)), axis=0) * scales
+        if shown.max() > LEAST_SHOWN:
             found[kind.name] = one
     return found
 
