@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium ci-extra docs peers third-party names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
+.PHONY: aravis chromium ci-extra coverage docs peers third-party names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
 
 setup: $(STAMP)
 
@@ -72,6 +72,14 @@ run: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow and not extra" $(ARGS)
+
+# Branch coverage of the everyday suite, in build/coverage/html; the tests take about twice as long. ARGS as pytest's.
+coverage: $(STAMP)
+	rm -rf build/coverage
+	$(BIN)/coverage run -m pytest -n 3 --dist worksteal -m "not slow and not extra" $(ARGS)
+	$(BIN)/coverage combine --quiet
+	$(BIN)/coverage html --quiet
+	$(BIN)/coverage report | tail -1
 
 # What CI runs beside `make test`: a browser, other programs, a database server, the wheel, whole sessions of the mock bench, whole diagnoses.
 ci-extra: $(STAMP)

@@ -137,6 +137,7 @@ SIZES: dict[str, str] = {
     "adc_nonlinearity": "left:error_dn=4",
     "adc_step": "left:step_dn=3,code_dn=1500",
     "ambient_light": "both:rate_e_per_s=400,red_over_blue=3",
+    "alternating_row_noise": "left:noise_e=3",
     "amplifier_crosstalk": "left:share_percent=2,excess_percent=0.5",
     "amplifier_glow": "left:glow_e_per_s=60,reach_mm=0.5",
     "astigmatism": "left:defocus_x_um=22",

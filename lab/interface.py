@@ -44,9 +44,6 @@ def _presenter() -> Presenter:
 present_with(_presenter)
 
 
-# --- recordings -------------------------------------------------------------------------------------------------------
-
-
 def open_recordings(
     path: str | Path, kind: str | None = None, *, data: str | Path | None = None, **stated: Any
 ) -> RecordingSet:
@@ -112,9 +109,6 @@ def _as_paths(stated: Mapping[str, Any]) -> dict[str, Any]:
 
 def _opened(recordings: RecordingSet | str | Path) -> RecordingSet:
     return open_recordings(recordings) if isinstance(recordings, str | Path) else recordings
-
-
-# --- calibrate --------------------------------------------------------------------------------------------------------
 
 
 def _run(request: PipelineRequest, progress: bool | None) -> PipelineResult:
@@ -305,9 +299,6 @@ def write_camera(camera: CameraFile, file: str | Path) -> Path:
     return Path(file)
 
 
-# --- predict and simulate ---------------------------------------------------------------------------------------------
-
-
 def predict(
     cameras: Mapping[Side, CameraFile],
     plan: RecordingSet | str | Path,
@@ -465,9 +456,6 @@ def write_frame(simulation: Simulation, file: str | Path) -> Path:
     return path
 
 
-# --- results ----------------------------------------------------------------------------------------------------------
-
-
 def compare(a: FitResult | RecordingSet | str | Path, b: FitResult | RecordingSet | str | Path) -> ComparisonResult:
     """Compare two calibrations: which figures changed beyond their uncertainty.
 
@@ -585,9 +573,6 @@ def write_report(
     return written(file, opened, fit, validation, diagnosis, both=both)
 
 
-# --- certificates, of stored sessions ---------------------------------------------------------------------------------
-
-
 def certify(
     session: str,
     limits: CalibrationLimits | str | Path | None = None,
@@ -645,9 +630,6 @@ a database server's, set CALIBENCH_DATABASE_URL as the service has it
 
     with contextlib.closing(store_to_read(None if data is None else Path(data))) as store:
         return write(store, life.calibration(store, session), Path(file))
-
-
-# --- benches ----------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager

@@ -25,11 +25,11 @@ def extensions(group: Group) -> Iterator[tuple[str, Any]]:
     """Yield name and object of every extension of a group that can be loaded; the others are refused."""
     for point in installed(group):
         try:
-            found = point.load()
+            extension = point.load()
         except Exception as error:  # whatever another's module does when it is imported
             refuse(group, point.name, f"{point.value} can't be loaded ({type(error).__name__}: {error})")
         else:
-            yield point.name, found
+            yield point.name, extension
 
 
 def refuse(group: Group, name: str, why: str) -> None:

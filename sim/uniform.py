@@ -19,7 +19,7 @@ from sim.sensor.amplifiers import CoupledAmplifiers
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.lines import LineGains, LineNoise, Lines
 from sim.sensor.particles import Particles
-from sim.sensor.reading_order import OrderedNoise
+from sim.sensor.reading_order import ReadOutNoise
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, codes_of, image_of, light_of, signal_of
 
@@ -58,10 +58,17 @@ GOLDEN_RATIO = 0.5 * (np.sqrt(5.0) - 1.0)
 
 @cache
 def noise_values(points: int) -> FloatArray:
-    """Values of equal weight that stand for a normal variable of mean 0 and standard deviation 1, (points, values).
+    """Choose values of equal weight that stand for a normal variable of mean 0 and standard deviation 1 at each
+    point.
 
-    At each point, the quantiles (i + s) / k, i = 0..k - 1. The offset s differs from point to point by the golden
-    ratio, so that points whose levels are alike sample the distribution k x points times.
+    points : number of points
+
+    Returns (points, values): at each point the quantiles (i + s) / k, i = 0..k - 1. The offset s differs from point
+    to point by the golden ratio, so that points of similar levels sample the distribution k x points times.
+
+    >>> values = noise_values(4)
+    >>> abs(round(float(values.mean()), 9)), round(float(values.std()), 9)
+    (0.0, 1.0)
     """
     count = int(np.clip(NOISE_VALUES // points, LEAST_AT_A_POINT, MOST_AT_A_POINT))
     offset = (0.5 + GOLDEN_RATIO * np.arange(points)) % 1.0
@@ -255,11 +262,11 @@ class Uniform:
         lit = {}
         for channel, rate in rates.items():
             ambient = (self._light.ambient(channel) * collected_s)[..., None]
-            seen = rate * _of_each(partial(self._light.colour, channel), elapsed_s)
-            light = (seen * source_s)[..., None] * field.light
+            detected = rate * _of_each(partial(self._light.colour, channel), elapsed_s)
+            light = (detected * source_s)[..., None] * field.light
             if self.leaks:
                 leaked = self.leaked_s(field) * field.light
-                light = light + (seen * _of_each(self._light.source, elapsed_s))[..., None] * leaked
+                light = light + (detected * _of_each(self._light.source, elapsed_s))[..., None] * leaked
             lit[channel] = light + ambient
         strayed = self.stray_light(lit, field)
         return {c: light * mixed.get(c, np.ones(()))[..., None] + dark for c, light in strayed.items()}
@@ -289,7 +296,7 @@ class Uniform:
         level = dict(zip(electrons, np.broadcast_arrays(*electrons.values()), strict=True))
         shape = next(iter(level.values())).shape
         each = [self.mixing_factors({c: float(v[at]) for c, v in level.items()}) for at in np.ndindex(shape)]
-        return {c: np.array([one[c] for one in each]).reshape(shape) for c in electrons}
+        return {c: np.array([factors[c] for factors in each]).reshape(shape) for c in electrons}
 
     def mixing_factors(
         self, electrons: Mapping[str, float], at_px: tuple[float, float] | None = None
@@ -414,14 +421,14 @@ class Uniform:
 
         Returns (n, k).
         """
-        found = np.zeros(electrons.shape)
+        released_e = np.zeros(electrons.shape)
         for traps in self._charge.traps:
             held, end_s = np.zeros(electrons.shape[1]), 0.0
             for k, (start_s, open_s) in enumerate(zip(begin_s, exposure_s, strict=True)):
                 released, left = traps.release(held, start_s - end_s, open_s)
-                found[k] += released
+                released_e[k] += released
                 held, end_s = traps.fill(left, electrons[k]), start_s + open_s
-        return found
+        return released_e
 
     def shot_e2(self, electrons: FloatArray, gain_db: float = 0.0) -> FloatArray:
         """Variance of the shot noise (e^2) at mean signals, at a gain setting."""
@@ -487,7 +494,7 @@ class Uniform:
 
     def line_gain_std(self, lines: Lines) -> float:
         """Relative standard deviation of the gains of rows or columns."""
-        return float(np.sqrt(sum(one.relative_std**2 for one in self.line_gains if one.lines == lines)))
+        return float(np.sqrt(sum(gains.relative_std**2 for gains in self.line_gains if gains.lines == lines)))
 
     def offset_dn(self, elapsed_s: float, temperature_c: float | None, exposure_s: float) -> float:
         """DN added to the black level, beside the mean of `added_e`."""
@@ -502,7 +509,9 @@ class Uniform:
     def added_e(self) -> FloatArray:
         """Mean of what read-out adds to every pixel, lit or dark (rows, cols)."""
         shape = self.camera.rows, self.camera.cols
-        return sum((np.asarray(one.mean_e(shape)) for one in self._signal.disturbances), np.zeros(shape))
+        return sum(
+            (np.asarray(disturbance.mean_e(shape)) for disturbance in self._signal.disturbances), np.zeros(shape)
+        )
 
     @property
     def lines(self) -> tuple[LineNoise, ...]:
@@ -510,7 +519,7 @@ class Uniform:
         return self._signal.lines
 
     @property
-    def reading_order(self) -> tuple[OrderedNoise, ...]:
+    def reading_order(self) -> tuple[ReadOutNoise, ...]:
         """Noise in the order in which pixels are read."""
         return self._signal.reading_order
 
@@ -574,4 +583,4 @@ def _lines_at(combs: FloatArray, at_px: float | None) -> FloatArray:
 
 def _of_each(law: Callable[[float], float], value: FloatArray | float) -> FloatArray:
     """Return a law of one number at every number of an array."""
-    return np.array([law(float(one)) for one in np.ravel(value)]).reshape(np.shape(value))
+    return np.array([law(float(number)) for number in np.ravel(value)]).reshape(np.shape(value))

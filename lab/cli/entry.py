@@ -146,8 +146,8 @@ def run_command_line(commands: Callable[[], Any], program: str, arguments: list[
             return EXIT_INPUT
         if os.environ.get("CALIBENCH_DEBUG"):
             traceback.print_exc()
-        if (told := failure_of_environment(error)) is not None:
-            err.print(f"[red]{speaker}:[/] {escape(str(told))}")
+        if (failure := failure_of_environment(error)) is not None:
+            err.print(f"[red]{speaker}:[/] {escape(str(failure))}")
             return EXIT_INPUT
         text = " ".join(str(error).split())
         err.print(

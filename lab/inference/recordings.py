@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from lab.capture_kinds.base import Capture
+from lab.capture_kinds.chart import ChartCapture
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.side_model import any_aperture, dataset_of, measurement_model
 from lab.errors import NotDetermined
@@ -32,12 +33,14 @@ from lab.inference.statements.statement import (
 )
 from lab.observables.dataset import Dataset
 from lab.observables.gaussian import Gaussian
-from lab.observables.observable import Observable, Prediction, measurements
+from lab.observables.observable import Label, Observable, Prediction, measurements
 from sim.camera import Side
 from sim.effects.base import Effect, Effects
 from sim.effects.library import candidates
 from sim.effects.other_f_number import OtherFNumber
+from sim.scene.colorchecker import reflectances
 from sim.spectrum import FloatArray
+from sim.uniform import electron_rate
 
 #: Standard deviations of the noise by which a usual size has to change the numbers.
 LEAST_SHOWN = 0.3
@@ -151,7 +154,14 @@ class SideProblem:
 
     def numbers(self, model: MeasurementModel) -> Numbers:
         """Return the numbers of a model of this side with their captures, held-out ones too."""
-        return Numbers(model, {c.id: c for c in self.dataset.in_time_order}, self.dataset.stated)
+        return Numbers(model, {c.id: c for c in self.dataset.in_time_order}, self.dataset.stated, self._rate)
+
+    def _rate(self, capture: Capture, label: Label, channel: str) -> float:
+        """Electrons a second on axis in the light of a narrowband or chart capture, by the baseline."""
+        known = reflectances(capture.chart) if isinstance(capture, ChartCapture) else {}
+        light = self.dataset.spectrum(str(getattr(capture, "radiance", None)))
+        reflectance = known.get(label.condition)
+        return electron_rate(self.dataset.camera, channel, light, kind=capture.kind, reflectance=reflectance)
 
     def side_model(self, groups: Sequence[Group]) -> SideModel:
         """Return the model of the numbers that are used."""

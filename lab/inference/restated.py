@@ -49,9 +49,8 @@ def examine_side(
     """Weigh the statements that decide what can be measured, measure and search; where a statement is wrong with the
     probability of a name, measure and search once more with the value that fits.
 
-    What is told of effects belongs to the last table: a wrong mosaic mixes colours in every number by channel, so that
-    effects beside it in the first table describe the mixture. Arguments as of `measure_side`; `report` is called with
-    each step in words."""
+    What is told of effects belongs to the last table. Estimates that the model is linear about, such as the dark
+    current, are made anew. Arguments as of `measure_side`; `report` is called with each step in words."""
     begin = recordings
     recordings, wrong = weigh_beforehand(recordings, side)
     searched: Searched | None = None

@@ -174,9 +174,6 @@ def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) ->
     return sorted(chosen.values(), key=missed, reverse=True)[:most]
 
 
-# --- heat maps --------------------------------------------------------------------------------------------------------
-
-
 def place_maps(diagnosis: DiagnosisResult, sides: Sequence[Side]) -> list[tuple[str, Figure]]:
     """Heat maps of significance by measurement and axis, one for each side and model (baseline, and improved model
     where effects were named)."""
@@ -249,9 +246,6 @@ def _short(sigma: float) -> str:
     return f"{sigma:.1f}" if sigma < 9.95 else f"{sigma:.0f}" if sigma < 99.5 else "99+"
 
 
-# --- residual pictures ------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _ResidualImages:
     """One frame's residual images by both models."""
@@ -278,9 +272,6 @@ class _ResidualImages:
             rms_before=f"{np.sqrt(np.mean(np.square(before))):.2f}",
             rms_after=f"{np.sqrt(np.mean(np.square(after))):.2f}",
         )
-
-
-# --- smallest detectable effects --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,6 @@ from sim.scene.colorchecker import reflectances
 from sim.sensor import mosaic
 from sim.spectrum import Spectrum
 
-# --- Options of an import: what the user states because a format doesn't hold it --------------------------------------
-
 
 @dataclass(frozen=True)
 class ImportOptions:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,12 +12,16 @@ from lab.formats.recording_set import RecordingSet
 from lab.inference.hypotheses import Hypothesis
 from lab.inference.model import State
 from lab.inference.posterior import NAMED, parameter_slice, weights_of_sets
-from lab.inference.search import Search, Table
+from lab.inference.search import FittedSet, Search, Table
 from lab.inference.statements.statement import Restatement
 from sim.camera import Side
 
 if TYPE_CHECKING:
     from lab.inference.recordings import SideModel
+
+
+#: Share of the probability from which on another value is told.
+LEAST_TOLD = 0.02
 
 
 def is_statement(hypothesis: Hypothesis) -> bool:
@@ -52,18 +56,34 @@ def wrong_statements(
         std = np.sqrt(np.maximum(np.diag(fit.laplace.covariance)[own], 0.0))
         told = restatement.told(recordings, side, point.u + fit.laplace.mean[own], std)
         assert restatement.measurement is not None
+        check = " ".join([told.check, *_others(recordings, side, fit, name)])
         model = search.model
         without: State = {n: p for n, p in fit.state.items() if n != name}
         before, n = _chi2(model, without, restatement)  # type: ignore[arg-type]
         after, _ = _chi2(model, fit.state, restatement)  # type: ignore[arg-type]
         found.append(
             Misstatement(
-                restatement.measurement, told.where, told.shape, told.check, before, after, n, told.captures,
+                restatement.measurement, told.where, told.shape, check, before, after, n, told.captures,
                 told.corrected, told.correction, min(probabilities[name], 1.0),
             )
         )  # fmt: skip
         recordings = told.corrected
     return tuple(found)
+
+
+def _others(recordings: RecordingSet, side: Side, fit: FittedSet, name: str) -> Iterator[str]:
+    """Yield, in words, other values of a wrong statement that hold a part of the probability of a set."""
+    modes = (fit, *fit.others)
+    log = np.array([fit.base - fit.shift, *(m.base for m in fit.others)])
+    share = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
+    for mode, p in zip(modes[1:], share[1:], strict=True):
+        point, own = mode.state[name], parameter_slice(mode, name)
+        if p < LEAST_TOLD or point.template is fit.state[name].template:
+            continue
+        std = np.sqrt(np.maximum(np.diag(mode.laplace.covariance)[own], 0.0))
+        other: Restatement = point.template
+        told = other.told(recordings, side, point.u + mode.laplace.mean[own], std)
+        yield f"Or, with a share of {100.0 * p:.0f} % of the probability: {told.check}"
 
 
 def _chi2(model: SideModel, state: State, restatement: Restatement) -> tuple[float, int]:

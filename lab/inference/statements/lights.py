@@ -12,9 +12,8 @@ from itertools import combinations
 
 import numpy as np
 
-from lab.capture_kinds.base import Capture
 from lab.formats.recording_set import RecordingSet
-from lab.inference.statements.statement import Change, Changes, Numbers, Restatement, Statement, Told
+from lab.inference.statements.statement import Change, Changes, Numbers, Restatement, Statement, Told, light_of
 from lab.observables.charts.chart import CHART
 from lab.observables.observable import Measurement
 from lab.observables.spectra.narrowband import NARROWBAND
@@ -23,19 +22,16 @@ from sim.spectrum import FloatArray
 
 #: Lights that there have to be.
 LEAST_LIGHTS = 3
+#: Rate, e/s, below which a level tells nothing of that in another light.
+LEAST_RATE = 1e-3
 #: What the improved model says of captures that aren't used.
 LEFT_OUT = "the captures are left out"
-
-
-def _light(capture: Capture) -> Hashable:
-    """Return what tells a capture's light from others: its wavelength, else its reading."""
-    return getattr(capture, "wavelength_nm", None) or getattr(capture, "radiance", None)
 
 
 def _restatements(numbers: Numbers) -> Sequence[Restatement]:
     found: list[Restatement] = []
     for measurement in (NARROWBAND, CHART):
-        lights = list(dict.fromkeys(_light(captures[0]) for _, _, captures in numbers.of(measurement)))
+        lights = list(dict.fromkeys(light_of(captures[0]) for _, _, captures in numbers.of(measurement)))
         if len(lights) < LEAST_LIGHTS:
             continue
         found += [
@@ -48,19 +44,26 @@ def _restatements(numbers: Numbers) -> Sequence[Restatement]:
 def _on(measurement: Measurement, pair: tuple[Hashable, Hashable], numbers: Numbers) -> Changes:
     noise = numbers.model.noise
     assert noise is not None
-    every = [(k, label, c[0]) for k, label, c in numbers.of(measurement) if _light(c[0]) in pair]
+    every = [(k, label, c[0]) for k, label, c in numbers.of(measurement) if light_of(c[0]) in pair]
     place = {} if measurement is NARROWBAND else {k: label.condition for k, label, _ in every}  # the patch
     rows = np.array([k for k, _, _ in every], int)
+    found = {light_of(c): c for _, _, c in every}
     matrix, offset, spread = np.zeros((len(rows), len(rows))), np.zeros(len(rows)), np.zeros(len(rows))
     for i, (k, label, capture) in enumerate(every):
         own_s = float(capture.exposure_s or 0.0)
         there = [
             (j, float(c.exposure_s or 0.0))
             for j, (other, one, c) in enumerate(every)
-            if _light(c) != _light(capture) and one.channel == label.channel and place.get(other) == place.get(k)
+            if light_of(c) != light_of(capture) and one.channel == label.channel and place.get(other) == place.get(k)
         ]
-        if not there or own_s <= 0.0:  # it clips in the other light: any level
-            matrix[i, i], spread[i] = 1.0, max(abs(float(numbers.model.value[k])), 1.0)
+        if not there:  # it clips in the other light: by the ratio of the rates
+            (wanted,) = (light for light in pair if light != light_of(capture))
+            rates = [numbers.rate(c, label, label.channel) for c in (capture, found[wanted])]
+            if rates[0] < LEAST_RATE:  # nor that: any level
+                matrix[i, i], spread[i] = 1.0, max(abs(float(numbers.model.value[k])), 1.0)
+                continue
+            matrix[i, i] = rates[1] / rates[0]
+            offset[i] = (1.0 - matrix[i, i]) * noise.black
             continue
         offset[i] = noise.black
         for j, other_s in there:
@@ -77,7 +80,7 @@ def _told(
 ) -> Told:  # fmt: skip
     kind = "narrowband" if measurement is NARROWBAND else "chart"
     names = [f"{one:g} nm" if isinstance(one, float) else str(one) for one in pair]
-    captures = [[c.id for c in recordings.captures(kind, side) if _light(c) == one] for one in pair]
+    captures = [[c.id for c in recordings.captures(kind, side) if light_of(c) == one] for one in pair]
     of = [f"{own[0]}{' ..' if len(own) > 1 else ''}" for own in captures]
     every = tuple(name for own in captures for name in own)
     return Told(

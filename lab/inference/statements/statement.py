@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -33,11 +33,13 @@ MOST_ALTERNATIVES = 12
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """The numbers of a model, with the captures that they were measured from, and what is stated of the camera."""
+    """The numbers of a model, with the captures that they were measured from, and what is stated of the camera. `rate`:
+    electrons a second by the baseline of a capture, a number's label and a channel."""
 
     model: MeasurementModel
     captures: Mapping[str, Capture]
     stated: DataSheet
+    rate: Callable[[Capture, Label, str], float]
 
     def of(self, *measurements: Measurement) -> Iterator[tuple[int, Label, tuple[Capture, ...]]]:
         """Yield index, label and captures of every number of these measurements."""
@@ -198,6 +200,11 @@ def hypotheses_of_statements(numbers: Numbers) -> dict[str, Hypothesis]:
     """Return every statement that these numbers can show to be wrong, as a hypothesis."""
     found = {one.name: one.hypothesis(numbers) for one in statements()}
     return {name: hypothesis for name, hypothesis in found.items() if hypothesis is not None}
+
+
+def light_of(capture: Capture) -> Hashable:
+    """Return what tells a capture's light from others: its wavelength, else its reading."""
+    return getattr(capture, "wavelength_nm", None) or getattr(capture, "radiance", None)
 
 
 def restated_camera(recordings: RecordingSet, side: Side, **values: object) -> RecordingSet:

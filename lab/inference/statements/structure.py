@@ -1,5 +1,6 @@
 """Statements that decide what can be measured at all, weighed before anything is: the unit of exposures, the number of
-bits, colour filters, kinds and frames under each other's captures, a board's squares, a screen's cells.
+bits, colour filters and their order, kinds and frames under each other's captures, a board's squares, a screen's
+cells.
 
 Each has numbers of its own that no effect and no parameter of the camera predicts, so that its odds don't depend on the
 table of sets:
@@ -7,7 +8,9 @@ table of sets:
     ln odds = ln(p / (1 - p)) + (chi2 as stated - chi2 with the value that fits) / 2 - ln(alternatives)
 
 with the prior probability p and the number of other values that would have been looked at. Of the unit of exposures the
-numbers are the stated exposures themselves, of the bits the pixels that are clipped."""
+numbers are the stated exposures themselves, of the bits the pixels that are clipped. Of a mosaic's order they are the
+rates of the four planes in all lights, which effects change by less than the factors between colours; the means by
+channel that the table is about don't tell RGGB from BGGR where GRBG is stated: both mix red and blue in green."""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from lab.diagnose.metadata.frames import (
     misstated_bit_depth,
     misstated_exposure_unit,
 )
-from lab.diagnose.metadata.lights import misstated_mosaic
+from lab.diagnose.metadata.lights import misstated_mosaic, misstated_mosaic_phase
 from lab.diagnose.metadata.misstatement import Misstatement
 from lab.diagnose.metadata.targets import misstated_board, misstated_cell_size
 from lab.formats.recording_set import RecordingSet
@@ -80,6 +83,7 @@ _CHECKS = (
     _Check(misplaced_frames),
     _Check(misstated_bit_depth, _of_bits),
     _Check(misstated_mosaic),
+    _Check(misstated_mosaic_phase),
     _Check(misstated_cell_size),
     _Check(misstated_board),
 )
