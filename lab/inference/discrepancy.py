@@ -108,9 +108,9 @@ TRANSFER, FIELD, SPECTRAL, LINES, RESPONSE, SOURCE, OFFSET, SHOT, ROWS, BORDERS 
         "rows that repeat", 0.00005, "1, of the sensitivity by row", "healthy sets of two simulators",
     ),
     GroupDeclaration(
-        "borders of cells", 0.15, "1, of the exponent of a screen's light by its drive",
+        "borders of cells", 0.05, "1, of the exponent of a screen's light by its drive",
         "a picture's file doesn't state how wide a screen draws the borders of cells: drawn with samples of 1/3 px, "
-        "they have an exponent of 0.86; of healthy sets 0.78 +- 0.07",
+        "they have an exponent of 0.86",
     ),
 )  # fmt: skip
 ON_OBSERVABLES = (
