@@ -290,21 +290,26 @@ class HealthyDraws:
     ) -> FloatArray:  # fmt: skip
         """Return p(no effect, nothing unlisted) of all draws, (D,), roughly and mostly too low: the scales of all other
         groups are at their medians, so that effects and flips also take what a group with a larger scale left."""
-        groups, draws, at = self.scales.groups, self.projected.shape[1], len(self.scales.gram)
+        groups, draws = self.scales.groups, self.projected.shape[1]
         middle = np.array([float(g.everyday_quantile(np.array(0.5))) for g in groups])
         flips = [np.zeros(draws)]
         more_prior = self.scales.prior_log[1] - self.scales.prior_log[0]
-        for g, values in self.scales.profiles_of_processes(middle, self.projected[:at]):
-            flips.append(logsumexp(values + np.log(groups[g].shares(True))[:, None], axis=0) + more_prior[g])
+        by_state: dict[str, FloatArray] = {}  # log evidence of the everyday scales of a state over that of their median
         for g, group in enumerate(groups):
-            if not group.may_be_unlisted or not group.varies(False):
+            if not group.varies(False):
                 continue
-            points = [group.scales(u) for u in (False, True)]
-            values = self.scales.profiles(g, middle, np.concatenate(points), self.projected[:at])
-            values += np.log(np.concatenate([group.shares(u) for u in (False, True)]))[:, None]
-            usual, other = np.split(values, [len(points[0])])
-            more = logsumexp(other, axis=0) - logsumexp(usual, axis=0)
-            flips.append(more + more_prior[g])
+            points, other = group.scales(False), group.scales(True) if group.may_be_unlisted else np.zeros(0)
+            at = np.concatenate([points, other, middle[g : g + 1]])
+            values = self.scales.profiles(g, middle, at, self.projected[: len(self.scales.gram)])
+            usual = logsumexp(values[: len(points)] + np.log(group.shares(False))[:, None], axis=0)
+            by_state[group.name] = usual - values[-1]
+            if group.may_be_unlisted:
+                beyond = values[len(points) : -1] + np.log(group.shares(True))[:, None]
+                flips.append(logsumexp(beyond, axis=0) - usual + more_prior[g])
+        for g, values in self.scales.profiles_of_processes(middle, self.projected[: len(self.scales.gram)]):
+            group = groups[g]
+            more = logsumexp(values + np.log(group.shares(True))[:, None], axis=0)
+            flips.append(more - by_state.get(group.name, np.zeros(draws)) + more_prior[g])
         gains = gains_of(self._odds(middle, signatures), hypotheses, signatures)
         return 1.0 / (np.exp(logsumexp(flips, axis=0)) + others_over_empty(gains, prior))
 
