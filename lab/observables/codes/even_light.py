@@ -117,7 +117,7 @@ class ExpectedCounts:
         value, column, pointer = np.concatenate(values, axis=1), np.concatenate(columns), np.array(counted)
         shape = len(rows), cells
         tables = tuple(sparse.csr_array((one, column, pointer), shape=shape) for one in value)
-        return cls(tables, *np.array(rows, float).T)  # type: ignore[arg-type]
+        return cls(tables, *np.array(rows, float).T)
 
     def followed(self, row: int) -> FloatArray:
         """Return the parts (codes, n) of the counts' noise, one standard deviation each, that the estimates follow:
