@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium ci-extra peers third-party names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
+.PHONY: aravis chromium ci-extra coverage docs peers third-party names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
 
 setup: $(STAMP)
 
@@ -56,6 +56,13 @@ third-party: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[third-party]'
 	rm -rf calibench.egg-info  # as above
 
+# The documentation as a site, with search and the reference of the Python interface: build/site/index.html. A link that leads nowhere fails.
+docs: $(STAMP)
+	$(BIN)/python -c 'import sphinx, myst_parser, furo' 2>/dev/null || \
+		$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[docs]'
+	rm -rf calibench.egg-info  # as above
+	$(BIN)/sphinx-build --quiet --fail-on-warning --jobs 2 -c docs . build/site $(ARGS)
+
 # The browser in which the tests drive the operator's page, from the distribution.
 chromium:
 	scripts/install-chromium
@@ -65,6 +72,14 @@ run: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow and not extra" $(ARGS)
+
+# Branch coverage of the everyday suite, in build/coverage/html; the tests take about twice as long. ARGS as pytest's.
+coverage: $(STAMP)
+	rm -rf build/coverage
+	$(BIN)/coverage run -m pytest -n 3 --dist worksteal -m "not slow and not extra" $(ARGS)
+	$(BIN)/coverage combine --quiet
+	$(BIN)/coverage html --quiet
+	$(BIN)/coverage report | tail -1
 
 # What CI runs beside `make test`: a browser, other programs, a database server, the wheel, whole sessions of the mock bench, whole diagnoses.
 ci-extra: $(STAMP)

@@ -98,9 +98,6 @@ EVERY_CHANGE = (*EVERYWHERE, 403, 507)
 open_to_all = APIRouter()
 
 
-# --- what needs no key ------------------------------------------------------------------------------------------------
-
-
 @open_to_all.get("/health", tags=["access"])
 def health() -> Health:
     """Whether the service is up."""
@@ -129,8 +126,8 @@ def ready(service: Here) -> Health:
 )
 def metrics(request: Request) -> Response:
     """Requests, sessions and jobs, as Prometheus reads them. Needs a key, in Prometheus' `authorization`."""
-    found: Metrics = request.app.state.metrics
-    return Response(found.text(), media_type=CONTENT_TYPE_PLAIN_0_0_4)
+    metrics: Metrics = request.app.state.metrics
+    return Response(metrics.text(), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
 @open_to_all.post("/login", tags=["access"], responses=answers(401, 403, 413, 422, 429))
@@ -200,9 +197,6 @@ def static_file(name: str) -> Response:
 def favicon() -> Response:
     """There is no icon; browsers remember this answer for a day."""
     return Response(status_code=204, headers={"Cache-Control": "max-age=86400"})
-
-
-# --- the application --------------------------------------------------------------------------------------------------
 
 
 def create_app(

@@ -97,16 +97,20 @@ class DeviceChecks:
     def _work(
         self, name: str, station: Station, devices: Sequence[str], keep_transcript: bool, let_go: Callable[[], None]
     ) -> None:
-        found: dict[str, Checked | None] = {}
+        checked_devices: dict[str, Checked | None] = {}
         try:
             for device in devices:
-                self._latest.update({(name, checked): one for checked, one in found.items()})
-                found[device] = self._checked(name, station, device, keep_transcript)
-            self._note_safety(station, found)
+                self._latest.update(
+                    {(name, checked): device_check for checked, device_check in checked_devices.items()}
+                )
+                checked_devices[device] = self._checked(name, station, device, keep_transcript)
+            self._note_safety(station, checked_devices)
         finally:
             let_go()
             # who reads that the last one's check has ended may use the instruments
-            self._latest.update({(name, device): found.get(device, self._kept(name, device)) for device in devices})
+            self._latest.update(
+                {(name, device): checked_devices.get(device, self._kept(name, device)) for device in devices}
+            )
 
     def _checked(self, name: str, station: Station, device: str, keep_transcript: bool) -> Checked | None:
         if self._closed:
@@ -118,10 +122,10 @@ class DeviceChecks:
             log.warning("check of %s, %s: isn't kept: %s", name, device, error)
         return checked
 
-    def _note_safety(self, station: Station, found: Mapping[str, Checked | None]) -> None:
+    def _note_safety(self, station: Station, checked_devices: Mapping[str, Checked | None]) -> None:
         """Keep that the station is safe where each of its instruments that may let light out was checked now and is."""
         may_shine = {device for device in station.devices if not device.startswith(NO_LIGHT)}
-        works = {device for device, one in found.items() if one is not None and one.state == "works"}
+        works = {device for device, check in checked_devices.items() if check is not None and check.state == "works"}
         if may_shine and may_shine <= works:
             shutter: Shutter = "none" if station.monochromator is None else "closed"
             self._live.safety.note(station, StationSafety(state="safe", shutter=shutter, at=now()))

@@ -310,14 +310,14 @@ class ServiceClient:
         them, the good one."""
         until = time.monotonic() + patience_s
         with progress_bar(self.progress) as advance:
-            while (found := look()).state not in ends:
+            while (present := look()).state not in ends:
                 if time.monotonic() > until:
-                    raise TimeoutError(f"after {patience_s:g} s: {what} is {found.state}")
-                advance(*_standing(found))
+                    raise TimeoutError(f"after {patience_s:g} s: {what} is {present.state}")
+                advance(*_standing(present))
                 time.sleep(LOOK_S)
-        if found.state != ends[0]:
-            raise ServiceProblem(409, f"{what} is {found.state}: {found.error}")
-        return found
+        if present.state != ends[0]:
+            raise ServiceProblem(409, f"{what} is {present.state}: {present.error}")
+        return present
 
     def health(self) -> Health:
         """Return whether the service is up, and its version."""
@@ -370,14 +370,14 @@ class ServiceClient:
         self, station: str, device: str, *, transcript: bool = False, patience_s: float = PATIENCE_S
     ) -> DeviceState:
         """Let an instrument work once and wait for the end of that; its `state` says whether it works."""
-        found = self.start_check(station, device, transcript=transcript)
+        check = self.start_check(station, device, transcript=transcript)
         until = time.monotonic() + patience_s
-        while found.state == "checking":
+        while check.state == "checking":
             if time.monotonic() > until:
-                raise TimeoutError(f"after {patience_s:g} s: {found!r}")
+                raise TimeoutError(f"after {patience_s:g} s: {check!r}")
             time.sleep(LOOK_S)
-            found = self.device(station, device)
-        return found
+            check = self.device(station, device)
+        return check
 
     def put_back(self, station: str) -> StationState:
         """Say that what sessions left changed by hand on a station is put back."""
@@ -775,8 +775,8 @@ class ServiceClient:
         """Return what matters for a use of each camera of a model; with a station, which of its sequences to take
         next."""
         params = {"use": use} | ({} if station is None else {"station": station})
-        found = self.request("GET", f"/camera-models/{model_id}/budget", params=params).json()
-        return {side: BudgetResult.model_validate(one) for side, one in found.items()}
+        budgets = self.request("GET", f"/camera-models/{model_id}/budget", params=params).json()
+        return {side: BudgetResult.model_validate(budget) for side, budget in budgets.items()}
 
     def compare(self, a: str, b: str, fail_on: Sequence[str] = ()) -> Comparison:
         """Two calibrations, by id, compared as `calibench compare` does."""

@@ -14,8 +14,7 @@ import typer
 
 from api.keys import Permission, check_bind, create_key, is_loopback, stored_keys
 from lab.capture.data_folder import open_store, store_to_read
-from lab.cli.console import Terminated
-from lab.errors import InputError, NoRoom
+from lab.errors import InputError, NoRoom, Terminated
 
 if TYPE_CHECKING:
     from lab.capture.store import Store
@@ -55,8 +54,8 @@ def logging_config() -> dict[str, Any]:
 
 def _listening(host: str, port: int) -> socket.socket:
     try:
-        found = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        family, _, _, _, address = found[0]
+        addresses = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, _, _, _, address = addresses[0]
         return socket.create_server(address[:2], family=family, backlog=128)
     except OSError as error:
         raise InputError(
@@ -76,7 +75,7 @@ def serve(
     ] = None,
     webhook_host: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="a host that may be told of sessions' ends (webhook); may be repeated"),
+        typer.Option(metavar="NAME", help="a host to which webhooks of sessions may be sent; may be repeated"),
     ] = None,
     create_first_key: Annotated[
         bool | None,
@@ -137,8 +136,8 @@ def serve(
         if makes_key and lack is None:
             _first_key(store)
         names = {name.strip("[]").lower() for name in [*(allow_host or []), host] if name not in _ANY}
-        told = {name.lower() for name in webhook_host or []}
-        app = create_app(store, hosts=names, webhook_hosts=told, recovery=recovery)
+        webhook_hosts = {name.lower() for name in webhook_host or []}
+        app = create_app(store, hosts=names, webhook_hosts=webhook_hosts, recovery=recovery)
         sys.setswitchinterval(SWITCH_S)
         server = uvicorn.Server(
             uvicorn.Config(

@@ -107,26 +107,26 @@ def _unknown_in_path(request: Request, name: str) -> Response:
     where = listed
     while where and "get" not in paths.get(where, {}):
         where = where.rpartition("/")[0]
-    said = f"no {request.path_params[name][:60]!r} among the {listed.rpartition('/')[2].replace('-', ' ')}"
-    return problem(404, request.app.state.public(f"{said}; see GET {re.sub('{.*?}', 'ID', where)}"))
+    detail = f"no {request.path_params[name][:60]!r} among the {listed.rpartition('/')[2].replace('-', ' ')}"
+    return problem(404, request.app.state.public(f"{detail}; see GET {re.sub('{.*?}', 'ID', where)}"))
 
 
-def _not_as_expected(request: Request, where: str, one: Mapping[str, Any]) -> str:
+def _not_as_expected(request: Request, where: str, problem: Mapping[str, Any]) -> str:
     """Return one line for what pydantic found: the field, what was sent, what is expected, an example."""
     expected = Expected(request)
-    if one["type"] == "value_error":  # of our own checks, which name the value
-        text = str(one["msg"]).removeprefix("Value error, ")
+    if problem["type"] == "value_error":  # of our own checks, which name the value
+        text = str(problem["msg"]).removeprefix("Value error, ")
         return f"{where}: {text}" if where else text
     if where:
-        return f"{where}: {_of_field(expected, one)}"
+        return f"{where}: {_of_field(expected, problem)}"
     sent = request.headers.get("content-type", "")
     also = "" if "json" in sent else f", with the header Content-Type: application/json (it is {sent[:60]!r})"
-    what = "is missing" if one.get("input") is None else "isn't a JSON object"
+    what = "is missing" if problem.get("input") is None else "isn't a JSON object"
     return f"the body: {what}; send one, such as {expected.example()}{also}"
 
 
-def _of_field(expected: Expected, one: Mapping[str, Any]) -> str:
-    kind, given, place = str(one["type"]), one.get("input"), one["loc"]
+def _of_field(expected: Expected, problem: Mapping[str, Any]) -> str:
+    kind, given, place = str(problem["type"]), problem.get("input"), problem["loc"]
     field = expected.field(place)
     give = f"; give {field}" if field else ""
     # A key that was sent is never repeated.
@@ -135,19 +135,19 @@ def _of_field(expected: Expected, one: Mapping[str, Any]) -> str:
         case "extra_forbidden":
             text = f"there is no such field; those that there are: {', '.join(expected.names(place[:-1])) or 'none'}"
         case "string_too_long":
-            text = f"{len(str(given))} characters, {one['ctx']['max_length']} at most; shorten it"
+            text = f"{len(str(given))} characters, {problem['ctx']['max_length']} at most; shorten it"
         case "string_pattern_mismatch":  # ids alone have patterns
             text = f"{str(given)[:60]!r} is no id: take one that the lists have, of letters, digits and hyphens"
         case "timezone_aware":
             text = f"{shown} has no time zone{give}"
         case "too_short":
-            text = f"{one['ctx']['actual_length']} given, {one['ctx']['min_length']} at least{give}"
+            text = f"{problem['ctx']['actual_length']} given, {problem['ctx']['min_length']} at least{give}"
         case "missing":
             text = f"is missing{give}"
         case _ if field and kind.endswith(("_type", "_parsing", "literal_error", "enum")):
             text = f"{shown} isn't taken{give}"
         case _:
-            ends = re.sub(r"^[A-Z]\w+ (should|must)", r"\1", str(one["msg"]))
+            ends = re.sub(r"^[A-Z]\w+ (should|must)", r"\1", str(problem["msg"]))
             text = f"{shown} {ends}{give}"
     return text
 
@@ -178,12 +178,12 @@ def _refused(request: Request, error: Exception) -> Response:
         methods = [method.upper() for path in paths_of(request) for method in paths[path]]
         headers["allow"] = ", ".join(dict.fromkeys(methods)) or headers.get("allow", "GET")
         return problem(405, f"{request.method} isn't for this path; use {headers['allow']}", headers)
-    said = str(error.detail)
-    if said == HTTPStatus.NOT_FOUND.phrase:  # the router's own
-        said = "there is no such path; /docs lists those that there are"
+    detail = str(error.detail)
+    if detail == HTTPStatus.NOT_FOUND.phrase:  # the router's own
+        detail = "there is no such path; /docs lists those that there are"
     if error.status_code == 400 and error.__cause__ is not None:  # the framework's, of a body that it can't decode
-        said = f"the body can't be read as JSON in UTF-8; send one, such as {Expected(request).example()}"
-    return problem(error.status_code, request.app.state.public(said), headers)
+        detail = f"the body can't be read as JSON in UTF-8; send one, such as {Expected(request).example()}"
+    return problem(error.status_code, request.app.state.public(detail), headers)
 
 
 class DefectMiddleware:
@@ -215,8 +215,8 @@ class DefectMiddleware:
             log.exception("%s %s: a defect", scope.get("method"), scope.get("path"))
             if begun:
                 raise
-            said = f"{type(error).__name__}: a defect of calibench; its log says more"
-            await problem(500, said)(scope, receive, send)
+            detail = f"{type(error).__name__}: a defect of calibench; its log says more"
+            await problem(500, detail)(scope, receive, send)
 
 
 def install(app: FastAPI) -> None:

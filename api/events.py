@@ -39,17 +39,17 @@ async def watched(
     """Yield the state now and after each change; the last event is called `end`. `look` reads the registry every
     `every_s` seconds, because other processes write to it, too; `changed` is called before a change of its `state` is
     told."""
-    seen: Any = None
+    last_sent: Any = None
     while True:
-        found: Any = await asyncio.to_thread(look)
-        ended = over(found)
-        if found != seen:
-            if seen is None or found.state != seen.state:
+        present: Any = await asyncio.to_thread(look)
+        ended = over(present)
+        if present != last_sent:
+            if last_sent is None or present.state != last_sent.state:
                 changed()
-            yield event(name, found)
-            seen = found
+            yield event(name, present)
+            last_sent = present
         if ended:
-            yield event("end", found)
+            yield event("end", present)
             return
         with anyio.move_on_after(every_s):
             await stopping.wait()

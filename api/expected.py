@@ -54,7 +54,7 @@ class Expected:
             kind = "a time with its zone"
         if "enum" in schema:
             kind = f"one of {', '.join(map(str, schema['enum']))}"
-        name = next((one for one in reversed(place) if isinstance(one, str)), "")
+        name = next((step for step in reversed(place) if isinstance(step, str)), "")
         example = json.dumps(self._example_at(place, schema), ensure_ascii=False)
         shown = f'{{"{name}": {example}}}' if place[0] == "body" else f"{name}={str(example).strip(chr(34))}"
         return f"{kind}, such as {shown}"
@@ -65,9 +65,9 @@ class Expected:
 
     def _schema_at(self, place: Sequence[int | str]) -> dict[str, Any] | None:
         if place[0] == "query":
-            for one in self._operation.get("parameters", ()):
-                if one["in"] == "query" and one["name"] == place[-1]:
-                    return self._resolved(one["schema"])
+            for parameter in self._operation.get("parameters", ()):
+                if parameter["in"] == "query" and parameter["name"] == place[-1]:
+                    return self._resolved(parameter["schema"])
             return None
         schema = self.body
         for part in place[1:]:
@@ -82,9 +82,9 @@ class Expected:
         """Return a schema with its reference followed, and the first that isn't null of several."""
         if "$ref" in schema:
             return self._resolved(self._schemas[schema["$ref"].rpartition("/")[2]])
-        for one in schema.get("anyOf", schema.get("oneOf", ())):
-            if one.get("type") != "null":
-                return self._resolved(one)
+        for alternative in schema.get("anyOf", schema.get("oneOf", ())):
+            if alternative.get("type") != "null":
+                return self._resolved(alternative)
         return schema
 
     def _example_at(self, place: Sequence[int | str], schema: dict[str, Any]) -> Any:

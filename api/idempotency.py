@@ -121,10 +121,10 @@ class Idempotency:
                 if row is None:
                     db.add(IdempotentRow(id=id, fingerprint=fingerprint, created=now()))
                     return None
-                found = (row.fingerprint, row.status, row.location, row.body)
+                stored = (row.fingerprint, row.status, row.location, row.body)
         except sa.exc.IntegrityError:  # another request took it just now
-            found = (fingerprint, None, None, None)
-        kept, status, location, body = found
+            stored = (fingerprint, None, None, None)
+        kept, status, location, body = stored
         if kept != fingerprint:
             return problem(422, f"{HEADER}: was used with another request; make a new key for each")
         if status is None:

@@ -51,10 +51,10 @@ def session_set(service: Service, session_id: str) -> KeptSet:
         raise Conflict(f"session {session_id} is {state}; wait for its end or abort it")
 
     def read() -> RecordingSet:
-        found = service.store.recording_set(session_id)
-        if not found.captures():
+        recordings = service.store.recording_set(session_id)
+        if not recordings.captures():
             raise InputError(f"session {session_id}: nothing was captured yet; resume it")
-        return found
+        return recordings
 
     def remove() -> None:
         check_nothing_rests_on(service.store, session_id)

@@ -91,19 +91,19 @@ def create_halt_token(store: Store, key: StoredKey) -> str:
 def halt_token_key(store: Store, sha256: str) -> StoredKey | None:
     """Return the key that the halt token of this hash was made for; None where it is no longer valid, or its key may
     only read."""
-    found = store.key_of_halt_token(sha256)
-    key = None if found is None else StoredKey(found[0], Permission(found[1]), found[2])
+    key_name = store.key_of_halt_token(sha256)
+    key = None if key_name is None else StoredKey(key_name[0], Permission(key_name[1]), key_name[2])
     return None if key is None or key.scope is Permission.READ else key
 
 
 def holder(key: str, stored: Iterable[StoredKey]) -> StoredKey | None:
     """Return the stored key that `key` is, or None; every stored key is compared, each in constant time."""
     mine = digest(key)
-    found = None
+    matching = None
     for candidate in stored:
         if hmac.compare_digest(mine, candidate.sha256):
-            found = candidate
-    return found
+            matching = candidate
+    return matching
 
 
 class EscapeControls(logging.Filter):
@@ -113,7 +113,7 @@ class EscapeControls(logging.Filter):
     def filter(self, record: logging.LogRecord) -> bool:
         """Escape a record's texts; no record is dropped."""
         if isinstance(record.args, tuple):  # kept one by one, as uvicorn's formatter unpacks them
-            record.args = tuple(_plain(one) for one in record.args)
+            record.args = tuple(_plain(argument) for argument in record.args)
         text = record.getMessage()
         if (plain := escaped(text, several_lines=True)) != text:
             record.msg, record.args = plain, ()

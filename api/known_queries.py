@@ -21,7 +21,7 @@ def _names(field: Any) -> list[str]:
 
 def _query(dependant: Dependant) -> list[Any]:
     """Return the query parameters of a route and of all that it depends on."""
-    return [*dependant.query_params, *(field for one in dependant.dependencies for field in _query(one))]
+    return [*dependant.query_params, *(field for dependency in dependant.dependencies for field in _query(dependency))]
 
 
 async def check_query(request: Request) -> None:

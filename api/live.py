@@ -35,8 +35,8 @@ APART_S = 0.2
 
 
 def _wake(followers: list[asyncio.Event]) -> None:
-    for one in followers:
-        one.set()
+    for follower in followers:
+        follower.set()
 
 
 class LiveSession:
@@ -136,14 +136,14 @@ class LiveSession:
         me = (asyncio.get_running_loop(), wake)
         with self._lock:
             self._followers.add(me)
-        seen = -1
+        last_number = -1
         try:
             while True:
                 wake.clear()
                 with self._lock:
                     number, latest, ended = self._number, self._latest, self._ended
-                if number != seen and latest is not None:
-                    seen = number
+                if number != last_number and latest is not None:
+                    last_number = number
                     yield latest
                 if ended or stopping.is_set():
                     return
@@ -342,14 +342,14 @@ class LiveSessions:
         try:
             shutter = capture.shut(reason)
         except Exception as error:
-            found = StationSafety(state="not confirmed", shutter="unknown", at=now(), words=str(error))
+            state = StationSafety(state="not confirmed", shutter="unknown", at=now(), words=str(error))
         else:
             if shutter is None:  # it connects or is packed: a connection of our own asks
                 self.make_safe(station, session_id).result()
                 return
-            found = StationSafety(state="halting", shutter=shutter, at=now())
+            state = StationSafety(state="halting", shutter=shutter, at=now())
         if capture.safe is None:  # else what the run says of itself at its end is newer than `found`
-            self.safety.note(station, found)
+            self.safety.note(station, state)
         else:
             self.safety.note(station, StationSafety.of(capture.safe))
 
@@ -373,8 +373,8 @@ class LiveSessions:
             self.safety.note_trouble(station, str(error))
             return
         try:
-            found = make_station_safe(station, self._connect, partial(self.safety.note_shut, station))
-            self.safety.note(station, StationSafety.of(found))
+            safe = make_station_safe(station, self._connect, partial(self.safety.note_shut, station))
+            self.safety.note(station, StationSafety.of(safe))
         finally:
             let_go()
 

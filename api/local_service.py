@@ -23,19 +23,19 @@ _ADDRESS = re.compile(r"operator's page: (http://\S+)/")
 @contextlib.contextmanager
 def service_process(data: Path) -> Iterator[str]:
     """`calibench serve` on a data folder, in a process of its own; its address."""
-    command = [sys.executable, "-m", "lab.cli", "serve", "--data", str(data), "--port", "0"]
+    command = [sys.executable, "-m", "calibench", "serve", "--data", str(data), "--port", "0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
     address: list[str] = []
-    said: list[str] = []
+    lines: list[str] = []
     ready = threading.Event()
 
     def listen() -> None:
         assert process.stdout is not None
         for line in process.stdout:
-            said.append(line)
-            if found := _ADDRESS.search(line):
-                address.append(found[1])
+            lines.append(line)
+            if match := _ADDRESS.search(line):
+                address.append(match[1])
             if "Uvicorn running" in line or "startup complete" in line:
                 ready.set()
         ready.set()
@@ -44,7 +44,7 @@ def service_process(data: Path) -> Iterator[str]:
     listener.start()
     try:
         if not ready.wait(START_S) or not address or process.poll() is not None:
-            raise RuntimeError("calibench serve doesn't start: " + "".join(said[-20:]))
+            raise RuntimeError("calibench serve doesn't start: " + "".join(lines[-20:]))
         yield address[0]
     finally:
         process.terminate()

@@ -40,9 +40,9 @@ class Pictures:
             return self._frame(source, capture_id)[0]
 
     def _read(self, recordings_id: str) -> RecordingSet:
-        found = self._inbox.recordings(recordings_id)
-        found.cache_bytes = 0  # `_frame` keeps some
-        return found
+        recordings = self._inbox.recordings(recordings_id)
+        recordings.cache_bytes = 0  # `_frame` keeps some
+        return recordings
 
     def picture(self, source: str, capture_id: int, width_px: int, stretch: bool, form: Form) -> bytes:
         """Return a capture as `preview` shows it. Raises InputError where its frame is missing or damaged."""

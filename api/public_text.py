@@ -32,7 +32,7 @@ class PublicText:
 
     def __call__(self, text: str) -> str:
         """Return a sentence without any path of the server."""
-        return _PATH.sub(lambda found: found["last"] or "a folder", self.within(text))
+        return _PATH.sub(lambda match: match["last"] or "a folder", self.within(text))
 
     def or_none(self, text: str | None) -> str | None:
         """As a call; None stays None."""

@@ -56,7 +56,7 @@ class MockBench:
 @pytest.fixture(scope="session")
 def calibench_bench(pytestconfig: pytest.Config) -> Iterator[MockBench]:
     """A mock bench in a process of its own, healthy but for what `--calibench-conceal` says."""
-    from lab.cli.bench_process import mock_bench
+    from lab.bench_process import mock_bench
 
     conceals = tuple(pytestconfig.getoption("--calibench-conceal") or ())
     with mock_bench(conceals, () if conceals else ("--healthy",)) as file:

@@ -32,11 +32,11 @@ class StationSafety(Frozen):
     words: str = ""
 
     @classmethod
-    def of(cls, found: SafeState) -> StationSafety:
+    def of(cls, state: SafeState) -> StationSafety:
         """From what the instruments answered."""
-        if found.complaints:
-            return cls(state="not confirmed", shutter=found.shutter, at=found.at, words="; ".join(found.complaints))
-        return cls(state="safe", shutter=found.shutter, at=found.at)
+        if state.complaints:
+            return cls(state="not confirmed", shutter=state.shutter, at=state.at, words="; ".join(state.complaints))
+        return cls(state="safe", shutter=state.shutter, at=state.at)
 
 
 class KnownSafety:
@@ -46,11 +46,11 @@ class KnownSafety:
     def __init__(self, store: Store, changed: Callable[[], None] = lambda: None) -> None:
         self._changed, self._lock = changed, threading.Lock()
         self._known: dict[str, StationSafety] = {}
-        seen: set[str] = set()
+        names: set[str] = set()
         for info in store.sessions(None, LOOKED_AT):  # the newest first
-            if info.state in ("created", "queued") or (key := key_of(store.station(info.id))) in seen:
+            if info.state in ("created", "queued") or (key := key_of(store.station(info.id))) in names:
                 continue
-            seen.add(key)
+            names.add(key)
             if info.state == "failed" and UNSAFE in (info.error or ""):
                 self._known[key] = StationSafety(
                     state="not confirmed", shutter="unknown", at=info.created, words=f"session {info.id}: {info.error}"
@@ -71,9 +71,9 @@ class KnownSafety:
                 self._known[key_of(station)] = safety
         self._changed()
 
-    def note_found(self, station: Station, found: SafeState) -> None:
+    def note_found(self, station: Station, state: SafeState) -> None:
         """Keep what the instruments answered when they were made safe."""
-        self.note(station, StationSafety.of(found))
+        self.note(station, StationSafety.of(state))
 
     def note_asked(self, station: Station) -> None:
         """Keep that the instruments are asked now."""
@@ -90,5 +90,9 @@ class KnownSafety:
 
 def key_of(station: Station) -> str:
     """Return what tells stations apart that have shutters of their own."""
-    one = station.monochromator
-    return one.address if one is not None and one.address else " ".join(sorted(station.addresses))
+    monochromator = station.monochromator
+    return (
+        monochromator.address
+        if monochromator is not None and monochromator.address
+        else " ".join(sorted(station.addresses))
+    )

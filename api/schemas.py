@@ -35,7 +35,7 @@ from lab.capture.station import Station
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
 from lab.capture_kinds.lamp import LampLight
 from lab.engine import DEFAULT_ENGINE, Engine
-from lab.formats.importers import KINDS
+from lab.foreign_recordings import KINDS
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
 from lab.formats.results.diagnosis import DiagnosisVerdict
 from lab.jobs import RemovedKind
@@ -99,7 +99,11 @@ class Asked(Schema):
         if not isinstance(data, dict):
             return data
         fields = cls.model_fields
-        lines = [name for name, field in fields.items() if any(isinstance(one, SeveralLines) for one in field.metadata)]
+        lines = [
+            name
+            for name, field in fields.items()
+            if any(isinstance(annotation, SeveralLines) for annotation in field.metadata)
+        ]
         for complaint in complaints_of(data, several_lines=lines):
             raise ValueError(complaint)
         for name, field in fields.items():
@@ -351,7 +355,9 @@ class DraftedLimits(Schema):
     def stated(self) -> CalibrationLimits:
         """Return them as limits to certify against. Raises pydantic's ValidationError: there is none, or a band has no
         end."""
-        kept = tuple(Limit(figure=one.figure, side=one.side, place=one.place, good=one.good) for one in self.limits)
+        kept = tuple(
+            Limit(figure=limit.figure, side=limit.side, place=limit.place, good=limit.good) for limit in self.limits
+        )
         return CalibrationLimits(valid_days=self.valid_days, limit=kept)
 
 
@@ -745,10 +751,6 @@ class RecordingsDetail(Recordings):
     results: dict[str, str] = Field(description="kind -> id of the newest `fit`, `validate`, `diagnose`, `report`")
 
 
-# --- the twin
-# ----------------------------------------------------------------------------------------------------------
-
-
 class SetAsked(Asked):
     """Recordings: a session's, or some that were sent in."""
 
@@ -818,9 +820,6 @@ class StoredPrediction(Schema):
     numbers: dict[Side, int] = Field(description="how many numbers are predicted")
     names: dict[Side, tuple[str, ...]] = Field(description="the names that the session will test")
     not_predicted: tuple[str, ...] = Field(default=(), description="why other numbers aren't predicted")
-
-
-# --- a station's devices ----------------------------------------------------------------------------------------------
 
 
 class DeviceState(Schema):

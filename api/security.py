@@ -30,9 +30,6 @@ COOKIE_LIFETIME_S = 12 * 3600.0
 HALT_COOKIE = "calibench_halt"
 
 
-# --- logins of the page -----------------------------------------------------------------------------------------------
-
-
 @dataclass
 class Logins:
     """The logins of the operator's page: random tokens, kept in memory until the process ends."""
@@ -90,13 +87,13 @@ class Gate:
         mine = digest(key)
         if mine not in self._proven and (wait_s := self.failures.wait_s(address)):
             raise TooManyFailures(wait_s)
-        found = holder(key, self.keys(False)) or holder(key, self.keys(True))
-        if found is None:
+        holder_of_key = holder(key, self.keys(False)) or holder(key, self.keys(True))
+        if holder_of_key is None:
             self._proven.discard(mine)
             self.failures.failed(address)
         else:
             self._proven.add(mine)
-        return found
+        return holder_of_key
 
     def identify(self, request: Request) -> StoredKey | None:
         """Return the key of a request, from the Authorization header, else from the page's cookie; None without a valid
@@ -119,9 +116,9 @@ class Gate:
 
     def identify_for_halt(self, request: Request) -> StoredKey | None:
         """Return the key of a request as `identify` does, else the key that its halt token was made for."""
-        found = self.identify(request)
+        identified = self.identify(request)
         token = request.cookies.get(HALT_COOKIE)
-        return found if found is not None or not token else self.halt_token_key(digest(token))
+        return identified if identified is not None or not token else self.halt_token_key(digest(token))
 
 
 def address_of(request: Request) -> str:
@@ -206,9 +203,6 @@ def set_cookies(response: Response, login: str, halt: str | None, *, secure: boo
             )
 
 
-# --- hosts ------------------------------------------------------------------------------------------------------------
-
-
 class SameHost:
     """Refuses a foreign Host (against DNS rebinding), and a foreign Origin where the request changes state (against
     cross-site requests)."""
@@ -252,8 +246,6 @@ class SameHost:
                 )
         return None
 
-
-# --- headers and bodies -----------------------------------------------------------------------------------------------
 
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "

@@ -88,14 +88,14 @@ class Service:
         file = self.station_file(name)
         with os.scandir(self.stations) as entries:  # a station's curves are files beside it
             there = frozenset(
-                (one.name, (at := one.stat()).st_mtime_ns, at.st_size) for one in entries if one.is_file()
+                (file.name, (at := file.stat()).st_mtime_ns, at.st_size) for file in entries if file.is_file()
             )
         return _read_station(file, there)
 
     def safety(self, station: Station) -> StationSafety | None:
         """Return what is known of a station's safe state, as an answer may have it."""
-        found = self.live.safety.find(station)
-        return found and found.model_copy(update={"words": self.public(found.words)})
+        safety = self.live.safety.find(station)
+        return safety and safety.model_copy(update={"words": self.public(safety.words)})
 
     def session(self, session_id: str) -> SessionInfo:
         """Return a session; 404 where there is none."""
@@ -161,10 +161,10 @@ class Service:
             run.model_copy(
                 update={
                     "instruments": {
-                        name: one.model_copy(
-                            update={key: self.public(value) for key, value in one if isinstance(value, str)}
+                        name: instrument.model_copy(
+                            update={key: self.public(value) for key, value in instrument if isinstance(value, str)}
                         )
-                        for name, one in run.instruments.items()
+                        for name, instrument in run.instruments.items()
                     },
                     "changes": tuple(map(self.public, run.changes)),
                 }

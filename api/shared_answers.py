@@ -51,8 +51,8 @@ class Shared:
 
     def find(self, asked: str) -> _Answer | None:
         """Return the answer that others got, or wait for; None where there is none."""
-        found = self._answers.get(asked)
-        return found if found is not None and time.monotonic() < found.until_s else None
+        answer = self._answers.get(asked)
+        return answer if answer is not None and time.monotonic() < answer.until_s else None
 
     def begin(self, asked: str) -> _Answer:
         """Return an answer that is going to be made."""
@@ -108,13 +108,13 @@ class SharedAnswers:
 
     async def _share(self, scope: Scope, receive: Receive, send: Send) -> None:
         asked = f"{scope['path']}?{scope['query_string'].decode('latin-1')}"
-        found = self.shared.find(asked)
-        if found is not None:
-            await found.made.wait()
-            if found.body is not None:
-                scope["route"] = found.route  # which the metrics name
-                await send({"type": "http.response.start", "status": 200, "headers": list(found.headers)})
-                await send({"type": "http.response.body", "body": found.body, "more_body": False})
+        answer = self.shared.find(asked)
+        if answer is not None:
+            await answer.made.wait()
+            if answer.body is not None:
+                scope["route"] = answer.route  # which the metrics name
+                await send({"type": "http.response.start", "status": 200, "headers": list(answer.headers)})
+                await send({"type": "http.response.body", "body": answer.body, "more_body": False})
                 return
         mine = self.shared.begin(asked)
         status = 0

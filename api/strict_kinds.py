@@ -30,11 +30,11 @@ def _check(where: str, value: Any, wanted: set[Any], *, none_allowed: bool) -> N
     shown = json.dumps(value) if isinstance(value, bool) else repr(value)[:60]
     numbers = bool(wanted & {int, float})
     if isinstance(value, list | tuple):
-        for number, one in enumerate(value):
-            _check(f"{where}.{number}", one, wanted, none_allowed=none_allowed)
+        for number, item in enumerate(value):
+            _check(f"{where}.{number}", item, wanted, none_allowed=none_allowed)
     elif isinstance(value, dict):
-        for name, one in value.items():
-            _check(f"{where}.{name}", one, wanted, none_allowed=none_allowed)
+        for name, item in value.items():
+            _check(f"{where}.{name}", item, wanted, none_allowed=none_allowed)
     elif value is None and numbers and not none_allowed:
         raise ValueError(f"{where}: null isn't a number; write one")
     elif isinstance(value, bool) and numbers and bool not in wanted:

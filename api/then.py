@@ -53,9 +53,9 @@ def kept_request(store: Store, session_id: str) -> SessionStart | None:
         kept, at, words = row.request, row.not_before, {"name": row.name, "notes": row.notes}
     if kept is None:
         return None
-    found = SessionStart.model_validate({name: of for name, of in kept.items() if name != "not_before"} | words)
+    start = SessionStart.model_validate({name: of for name, of in kept.items() if name != "not_before"} | words)
     zoned = at if at is None or at.tzinfo is not None else at.replace(tzinfo=UTC)
-    return found.model_copy(update={"queue": at is not None, "not_before": zoned})
+    return start.model_copy(update={"queue": at is not None, "not_before": zoned})
 
 
 def then_of(store: Store, session_id: str) -> ThenState | None:
@@ -156,7 +156,7 @@ class ThenRunner:
         """Do what is due."""
         asked = sa.select(SessionRow).where(SessionRow.then_state.in_(("waiting", "running")))
         with self._store.reading() as db:
-            found = [
+            following = [
                 _Following(
                     row.id,
                     row.name,
@@ -168,44 +168,48 @@ class ThenRunner:
                 for row in db.scalars(asked)
                 if row.request is not None and row.then_state is not None
             ]
-        for one in found:
+        for follows in following:
             if self._ended.is_set():
                 return
-            if one.then_state == "running":
-                self._look_at_job(one)
-            elif one.state == "finished" and self._live.find(one.id) is None:
-                self._begin(one)
-            elif one.state in ENDED_EARLY and self._live.find(one.id) is None:
-                self._tell_early_end(one)
-            elif "told_of" in one.then:
-                self._keep(one, "waiting", {})  # it goes on
+            if follows.then_state == "running":
+                self._look_at_job(follows)
+            elif follows.state == "finished" and self._live.find(follows.id) is None:
+                self._begin(follows)
+            elif follows.state in ENDED_EARLY and self._live.find(follows.id) is None:
+                self._tell_early_end(follows)
+            elif "told_of" in follows.then:
+                self._keep(follows, "waiting", {})  # it goes on
 
-    def _begin(self, one: _Following) -> None:
-        if one.asked.kind is None:
-            self._end(one, "done", one.then, "")
+    def _begin(self, follows: _Following) -> None:
+        if follows.asked.kind is None:
+            self._end(follows, "done", follows.then, "")
             return
         try:
-            capturer = self._live.capturer(self._store.station(one.id)) if one.asked.kind == "pipeline" else None
-            limits = ResolveLimits() if one.asked.resolve else None
-            job_id = self._jobs.submit(one.asked.kind, one.id, resolve=limits, capturer=capturer)
+            capturer = (
+                self._live.capturer(self._store.station(follows.id)) if follows.asked.kind == "pipeline" else None
+            )
+            limits = ResolveLimits() if follows.asked.resolve else None
+            job_id = self._jobs.submit(follows.asked.kind, follows.id, resolve=limits, capturer=capturer)
         except InputError as error:
-            self._end(one, "failed", one.then, str(error))
+            self._end(follows, "failed", follows.then, str(error))
             return
-        self._keep(one, "running", {"job_id": job_id})
+        self._keep(follows, "running", {"job_id": job_id})
 
-    def _look_at_job(self, one: _Following) -> None:
-        job = self._jobs.job(one.then["job_id"])
+    def _look_at_job(self, follows: _Following) -> None:
+        job = self._jobs.job(follows.then["job_id"])
         if not job.is_over:
             return
         if job.state != "done":
-            self._end(one, "failed", one.then, f"job {job.id} is {job.state}: {job.error or 'without a reason'}")
+            self._end(
+                follows, "failed", follows.then, f"job {job.id} is {job.state}: {job.error or 'without a reason'}"
+            )
             return
-        words, comparison = self._compared(one) if one.asked.compare else ("", None)
-        self._end(one, "done", one.then | ({"comparison": comparison} if comparison else {}), words)
+        words, comparison = self._compared(follows) if follows.asked.compare else ("", None)
+        self._end(follows, "done", follows.then | ({"comparison": comparison} if comparison else {}), words)
 
-    def _compared(self, one: _Following) -> tuple[str, str | None]:
+    def _compared(self, follows: _Following) -> tuple[str, str | None]:
         """Return how the newest fit of a session compares with the certified calibration of its cameras."""
-        newest = calibration(self._store, one.id)
+        newest = calibration(self._store, follows.id)
         of_rig = (CalibrationRow.rig == rig_of(newest.cameras), CalibrationRow.certified.is_not(None))
         asked = sa.select(CalibrationRow.id).where(*of_rig).order_by(CalibrationRow.certified.desc())
         with self._store.reading() as db:
@@ -214,32 +218,32 @@ class ThenRunner:
         if not certified:
             return "these cameras have no certified calibration to compare with", None
         a, b = (FitResult.model_validate(self._store.result(id).document) for id in (certified[0], newest.id))
-        found = compare(a, b)
-        number = sum(row.changed for row in found.changes) + sum(row.changed for row in found.projection)
-        total = len(found.changes) + len(found.projection)
+        comparison = compare(a, b)
+        number = sum(row.changed for row in comparison.changes) + sum(row.changed for row in comparison.projection)
+        total = len(comparison.changes) + len(comparison.projection)
         page = f"/api/v1/comparisons/page?a={certified[0]}&b={newest.id}"
         return f"{number or 'none'} of {total} figures changed since the certified calibration {certified[0]}", page
 
-    def _tell_early_end(self, one: _Following) -> None:
-        if one.then.get("told_of") != one.state:
-            told = self._told(one, {"words": f"the session is {one.state}"})
-            self._keep(one, "waiting", {"told_of": one.state, "told": told})
+    def _tell_early_end(self, follows: _Following) -> None:
+        if follows.then.get("told_of") != follows.state:
+            failure = self._told(follows, {"words": f"the session is {follows.state}"})
+            self._keep(follows, "waiting", {"told_of": follows.state, "told": failure})
 
-    def _end(self, one: _Following, state: str, then: dict[str, Any], words: str) -> None:
+    def _end(self, follows: _Following, state: str, then: dict[str, Any], words: str) -> None:
         kept = {key: value for key, value in then.items() if key != "told_of"} | {"words": words}
-        self._keep(one, state, kept | {"told": self._told(one, kept | {"then": state})})
+        self._keep(follows, state, kept | {"told": self._told(follows, kept | {"then": state})})
 
-    def _told(self, one: _Following, more: dict[str, Any]) -> str | None:
-        url = one.asked.webhook
+    def _told(self, follows: _Following, more: dict[str, Any]) -> str | None:
+        url = follows.asked.webhook
         if url is None:
             return None
         if (urlsplit(url).hostname or "").lower() not in self.hosts:
             return "the webhook wasn't told: the service is no longer started with its host"
-        return _tell(url, {"session": one.id, "name": one.name, "state": one.state} | more)
+        return _tell(url, {"session": follows.id, "name": follows.name, "state": follows.state} | more)
 
-    def _keep(self, one: _Following, state: str, then: dict[str, Any]) -> None:
+    def _keep(self, follows: _Following, state: str, then: dict[str, Any]) -> None:
         with self._store.transaction() as db:
-            row = db.get(SessionRow, one.id)
+            row = db.get(SessionRow, follows.id)
             if row is not None:
                 row.then_state, row.then = state, then
         self._changed()

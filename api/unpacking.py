@@ -112,24 +112,24 @@ class _Zip(_Archive):
 
     def members(self) -> Iterator[_Member]:
         separator = self.separator
-        for one in self._packed.infolist():
-            if stat.S_IFMT(one.external_attr >> 16) not in (0, stat.S_IFREG, stat.S_IFDIR):
-                raise _no_plain_file(one.filename)
+        for entry in self._packed.infolist():
+            if stat.S_IFMT(entry.external_attr >> 16) not in (0, stat.S_IFREG, stat.S_IFDIR):
+                raise _no_plain_file(entry.filename)
             # Another compression could take any amount of memory to undo.
-            if one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                method = _METHODS.get(one.compress_type, f"method {one.compress_type}")
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                method = _METHODS.get(entry.compress_type, f"method {entry.compress_type}")
                 raise InputError(
-                    f"archive: {one.filename[:80]!r} is compressed by {method}, neither stored nor deflated; pack it "
+                    f"archive: {entry.filename[:80]!r} is compressed by {method}, neither stored nor deflated; pack it "
                     "again with the ordinary compression of .zip (deflate)"
                 )
-            name = one.filename.replace(separator, "/")
-            yield _Member(name, one.file_size, name.endswith("/"), one)
+            name = entry.filename.replace(separator, "/")
+            yield _Member(name, entry.file_size, name.endswith("/"), entry)
 
     @property
     def separator(self) -> str:
         """What parts the names of folders: a backslash in an archive of Windows that has no slash at all, against the
         format."""
-        names = [one.filename for one in self._packed.infolist()]
+        names = [entry.filename for entry in self._packed.infolist()]
         windows = any("\\" in name for name in names) and not any("/" in name for name in names)
         return "\\" if windows else "/"
 
@@ -144,18 +144,18 @@ class _Tar(_Archive):
         self._packed = packed
 
     def members(self) -> Iterator[_Member]:
-        while (one := self._packed.next()) is not None:
+        while (entry := self._packed.next()) is not None:
             # A negative size would lead back to this header for ever. A sparse file states what it doesn't hold.
-            if one.size < 0 or one.issparse() or not (one.isreg() or one.isdir()):
-                raise _no_plain_file(one.name)
-            if one.isdir() and one.name in ("", ".", "./"):
+            if entry.size < 0 or entry.issparse() or not (entry.isreg() or entry.isdir()):
+                raise _no_plain_file(entry.name)
+            if entry.isdir() and entry.name in ("", ".", "./"):
                 continue
-            yield _Member(one.name, one.size, one.isdir(), one)
+            yield _Member(entry.name, entry.size, entry.isdir(), entry)
 
     def open(self, member: _Member) -> IO[bytes]:
-        found = self._packed.extractfile(member.entry)
-        assert found is not None  # a plain file, as `members` found
-        return found
+        content = self._packed.extractfile(member.entry)
+        assert content is not None  # a plain file, as `members` found
+        return content
 
 
 class _Bounded(io.RawIOBase):

@@ -71,7 +71,7 @@ class Foreign:
 
     def read(self, folder: Path) -> RecordingSet:
         """Return the recordings below `folder`. Raises InputError."""
-        from lab.formats.importers import KINDS, read_foreign
+        from lab.foreign_recordings import KINDS, read_foreign
 
         of_a_file = self.format in KINDS and KINDS[self.format].of_a_file
         if of_a_file and not self.path:
@@ -90,12 +90,12 @@ class Foreign:
     def _located(folder: Path, name: str, path: str, a_file: bool = True) -> Path:
         """Return a file or folder of the archive. Raises InputError where it isn't in it."""
         named = inside(path)
-        found = folder / named
-        if not found.exists() and named.parts[0] == folder.name:  # the one folder in which all of the archive is
-            found = folder.parent / named
-        if not (found.is_file() or (found.is_dir() and not a_file)):
+        place = folder / named
+        if not place.exists() and named.parts[0] == folder.name:  # the one folder in which all of the archive is
+            place = folder.parent / named
+        if not (place.is_file() or (place.is_dir() and not a_file)):
             raise InputError(f"{name} {path[:80]!r}: isn't in the archive; name it as in the archive")
-        return found
+        return place
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Inbox:
     def ids(self) -> list[str]:
         """Ids of all, the newest first."""
         entries = [entry for entry in self.root.glob("*") if _ID.fullmatch(entry.name) and entry.is_dir()]
-        return [entry.name for entry in sorted(entries, key=lambda one: (-one.stat().st_mtime_ns, one.name))]
+        return [entry.name for entry in sorted(entries, key=lambda entry: (-entry.stat().st_mtime_ns, entry.name))]
 
     def folder(self, id: str) -> Path:
         """Return the recording set's folder. Raises InputError where there is none of that id."""
@@ -150,9 +150,9 @@ class Inbox:
                 recordings = foreign.read(_top(sent, None))
                 notes = as_in_archive(recordings.manifest.notes, place)
                 recordings = recordings.under(recordings.manifest.model_copy(update={"notes": notes}))
-                found: list[str] = []
-                recording.write(recordings, unpacked, told=found.extend)
-                recordings.warnings += tuple(found)
+                warnings: list[str] = []
+                recording.write(recordings, unpacked, told=warnings.extend)
+                recordings.warnings += tuple(warnings)
         except InputError as error:
             raise InputError(as_in_archive(str(error), place)) from None
         recordings.warnings = (*remarks, *recordings.warnings)
@@ -170,8 +170,8 @@ class Inbox:
 
     def manifest(self, id: str) -> dict[str, Any]:
         """Return the manifest of kept recordings as it is written: it was checked when they were sent in."""
-        found: dict[str, Any] = json.loads((self.folder(id) / _MANIFEST).read_text(encoding="utf-8-sig"))
-        return found
+        manifest: dict[str, Any] = json.loads((self.folder(id) / _MANIFEST).read_text(encoding="utf-8-sig"))
+        return manifest
 
     def recordings(self, id: str) -> RecordingSet:
         """Kept recordings, whose frames are checked when they are read."""
@@ -194,7 +194,7 @@ def take_cameras(place: Path, archive: Path, limit_bytes: int) -> dict[Side, Cam
     try:
         for arrays in folder.glob("*.npz"):
             with zipfile.ZipFile(arrays) as packed:  # it may be compressed: what it states is what is read
-                check_size(sum(one.file_size for one in packed.infolist()), limit_bytes)
+                check_size(sum(entry.file_size for entry in packed.infolist()), limit_bytes)
         return {side: read_camera(file, sent=True) for side, file in named.items()}
     except TooMuch:
         raise

@@ -79,15 +79,19 @@ class QueueRunner:
             return
         ended = [id for id in self._store.under_way() if self._live.find(id) is None]
         taken = {address for id in ended for address in self._store.station(id).addresses}
-        for one in waiting:
+        for waiter in waiting:
             if self._holds:
                 return
-            if self._ended.is_set() or self._live.find(one.id) is not None:
+            if self._ended.is_set() or self._live.find(waiter.id) is not None:
                 continue
-            addresses = self._store.station(one.id).addresses
-            if one.held is None and (one.not_before is None or one.not_before <= now()) and not addresses & taken:
-                self._start(one.id, halts)
-            if one.not_before is None or one.held is not None:
+            addresses = self._store.station(waiter.id).addresses
+            if (
+                waiter.held is None
+                and (waiter.not_before is None or waiter.not_before <= now())
+                and not addresses & taken
+            ):
+                self._start(waiter.id, halts)
+            if waiter.not_before is None or waiter.held is not None:
                 taken |= addresses  # who comes later on these instruments waits for its turn
 
     def _write_holds(self) -> None:

@@ -3,7 +3,7 @@ table, a photograph.
 
 Peers: the slanted edge as ISO 12233:2005 has it (`peers/iso12233.py`), the objective of Mosleh et al.
 (`peers/mosleh.py`); the Cramer-Rao bound of a free line spread of +-4 px, and of a free kernel. Prints the tables of
-docs/explanation/accuracy.md, "MTF" and "PSF"."""
+docs/explanation/accuracy/blur.md."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ from api.pytest_plugin import service_process
 from api.schemas import SessionStart, Then
 from benchmarks.process_memory import MemoryWatch, by_kind
 from benchmarks.table import Row, show
+from lab.bench_process import mock_bench
 from lab.capture.store import Store
-from lab.cli.bench_process import mock_bench
 
 MB = 1e6
 #: Limits (MB, PSS) of the service and of the mock bench, and what is wanted of a quick run, MB and s.
@@ -73,7 +73,7 @@ def test_service_and_bench_over_sessions(tmp_path: Path) -> None:
 
 
 def test_quick_run(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "lab.cli", "run", "--quick", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "calibench", "run", "--quick", "--out", str(tmp_path)]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     began_s = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)

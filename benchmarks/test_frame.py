@@ -1,7 +1,7 @@
 """Whole frames, from light to codes: CPU time beside the limit that transforms, memory and random numbers set, and peak
 memory.
 
-Prints the tables of docs/explanation/performance.md.
+Prints the tables of docs/explanation/cost-of-a-frame.md.
 """
 
 from __future__ import annotations

@@ -32,11 +32,11 @@ from api.keys import Permission, create_key
 from api.pytest_plugin import service_process
 from api.schemas import SessionStart
 from benchmarks.table import Row, show
+from lab.bench_process import mock_bench
 from lab.capture.plan import full_plan
 from lab.capture.records import now
 from lab.capture.store import Store
 from lab.capture.tables import CaptureRow, FileRow, ResultRow, SessionRow, StepRow
-from lab.cli.bench_process import mock_bench
 from tests.lab.calibration.test_life import fitted
 from tests.lab.fake_bench import station
 

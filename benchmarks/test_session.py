@@ -69,7 +69,7 @@ def _most_held_bytes(command: list[str]) -> int:
 def test_the_command(session: Path, tmp_path: Path, name: str) -> None:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begun = time.perf_counter()
-    command = [sys.executable, "-m", "lab.cli", name, str(session), "--json", str(tmp_path / "found.json")]
+    command = [sys.executable, "-m", "calibench", name, str(session), "--json", str(tmp_path / "found.json")]
     memory = _most_held_bytes(command)
     wall = time.perf_counter() - begun
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

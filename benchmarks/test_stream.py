@@ -40,7 +40,7 @@ def addresses(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[str]]:
     for side in ("left", "right"):
         for number in range(8):
             np.save(folder / f"{number}-{side}.npy", rng.integers(0, 4096, (ROWS, COLS), np.uint16))
-    command = [sys.executable, "-m", "lab.cli", "mock", "u3v-stereo", "--frames", str(folder)]
+    command = [sys.executable, "-m", "calibench", "mock", "u3v-stereo", "--frames", str(folder)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
         assert running.stdout is not None
         yield [running.stdout.readline().split()[1] for _ in range(2)]

@@ -1,4 +1,4 @@
-"""The public Python interface of calibench: what may be relied on from outside. Everything else is private.
+"""The public Python interface of calibench: what may be relied on from outside. Everything else is private. ::
 
     import calibench
 

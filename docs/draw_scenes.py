@@ -1,4 +1,4 @@
-"""Draws docs/reference/scenes.png and prints the table of parameters in docs/reference/scenes.md: `python
+"""Draws docs/reference/scenes.png and prints the table of parameters in docs/reference/scene-parameters.md: `python
 docs/draw_scenes.py docs/reference/scenes.png`.
 
 Every tile is the scene itself, without lens and noise, in the camera's pixels: the lights' luminances and colours by

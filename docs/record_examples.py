@@ -30,7 +30,7 @@ def puzzle() -> RecordingSet:
 def bench(out: Path) -> None:
     """A quick session of the mock bench, written to `out`."""
     with tempfile.TemporaryDirectory() as data:
-        run = [sys.executable, "-m", "lab.cli"]
+        run = [sys.executable, "-m", "calibench"]
         subprocess.run([*run, "capture", "--quick", "--out", data], check=True)
         (session,) = (path.name for path in (Path(data) / "sessions").iterdir())
         subprocess.run([*run, "export", session, "--to", str(out), "--data", data], check=True)

@@ -75,8 +75,8 @@ class AlpacaDevice:
 
     def identity(self) -> Identity:
         """Return the device's name and its driver's. Raises `InstrumentError`."""
-        told = [str(self.get_if_there(name) or "") for name in ("driverinfo", "name", "driverversion")]
-        return Identity(told[0], told[1], self._unique_id(), told[2])
+        texts = [str(self.get_if_there(name) or "") for name in ("driverinfo", "name", "driverversion")]
+        return Identity(texts[0], texts[1], self._unique_id(), texts[2])
 
     def _unique_id(self) -> str:
         """Return the device's own identifier, which stays when its address changes; empty where the server doesn't
@@ -85,9 +85,9 @@ class AlpacaDevice:
         try:
             listed = self._value("configureddevices", *self._request("GET", "/management/v1/configureddevices", {}))
             return next(
-                str(one["UniqueID"])
-                for one in listed
-                if one["DeviceType"].lower() == kind and str(one["DeviceNumber"]) == number
+                str(entry["UniqueID"])
+                for entry in listed
+                if entry["DeviceType"].lower() == kind and str(entry["DeviceNumber"]) == number
             )
         except (Refused, Garbled, StopIteration, KeyError, TypeError, AttributeError):
             return ""
@@ -96,19 +96,19 @@ class AlpacaDevice:
         """Return the picture, (rows, cols)."""
         kind, body = self._request("GET", "imagearray", {}, accept=f"{_IMAGE_BYTES}, application/json")
         if kind.startswith(_IMAGE_BYTES):
-            return self._unpacked(body)
+            return self._unpack_picture(body)
         value = np.array(self._value("imagearray", kind, body))
         if value.ndim != 2:
             raise Garbled(f"{self._who}: a picture of {value.ndim} dimensions; 2 are wanted")
         return value.T
 
-    def _unpacked(self, body: bytes) -> NDArray[Any]:
+    def _unpack_picture(self, body: bytes) -> NDArray[Any]:
         """Return a picture sent as ImageBytes: eleven numbers, then columns."""
         if len(body) < 44:
             raise Garbled(f"{self._who}: a picture of {len(body)} bytes; let no proxy stand between")
         _, error, _, _, start, _, sent_as, rank, cols, rows, _ = struct.unpack("<11i", body[:44])
         if error:
-            raise self._refused("imagearray", error, body[start:].decode("utf-8", "replace"))
+            raise self._describe_refusal("imagearray", error, body[start:].decode("utf-8", "replace"))
         if rank != 2 or sent_as not in _TYPES:
             raise Garbled(f"{self._who}: a picture of rank {rank} and type {sent_as}; one of rank 2 is wanted")
         numbers = np.frombuffer(body[start:], _TYPES[sent_as]) if cols > 0 and rows > 0 else np.zeros(0)
@@ -147,22 +147,22 @@ class AlpacaDevice:
             answer = connection.getresponse()
             body = answer.read()
         except (OSError, http.client.HTTPException) as error:
-            raise self._broken(name, error, limit_s, over.is_set()) from error
+            raise self._describe_failure(name, error, limit_s, over.is_set()) from error
         finally:
             watch.cancel()
             connection.close()
         if over.is_set():
-            raise self._broken(name, TimeoutError(), limit_s, True)
+            raise self._describe_failure(name, TimeoutError(), limit_s, True)
         kind = answer.getheader("Content-Type", "")
         self._record("received", body[:200] if kind.startswith("application/json") else f"{len(body)} bytes".encode())
         if answer.status != 200:
-            raise self._refused(name, answer.status, body.decode("utf-8", "replace"))
+            raise self._describe_refusal(name, answer.status, body.decode("utf-8", "replace"))
         return kind, body
 
     def _value(self, name: str, kind: str, body: bytes) -> Any:
         try:
-            told = json.loads(body)
-            number, message = int(told.get("ErrorNumber", 0)), str(told.get("ErrorMessage", ""))
+            answer = json.loads(body)
+            number, message = int(answer.get("ErrorNumber", 0)), str(answer.get("ErrorMessage", ""))
         except (ValueError, AttributeError, TypeError):
             raise Garbled(
                 f"{self._who}: answered {name!r} with {body[:60]!r} ({kind}); is an Alpaca server at this address?"
@@ -170,15 +170,15 @@ class AlpacaDevice:
         if number == NOT_CONNECTED:
             raise Disconnected(f"{self._who}: {name!r}: the server has lost it ({_line(message)}); plug it in again")
         if number:
-            raise self._refused(name, number, message)
-        return told.get("Value")
+            raise self._describe_refusal(name, number, message)
+        return answer.get("Value")
 
-    def _refused(self, name: str, number: int, message: str) -> Refused:
+    def _describe_refusal(self, name: str, number: int, message: str) -> Refused:
         return Refused(
             f"{self._who}: {name!r} failed with {number:#x} ({_line(message)}); look it up in its driver", number
         )
 
-    def _broken(self, name: str, error: Exception, limit_s: float, over: bool) -> InstrumentError:
+    def _describe_failure(self, name: str, error: Exception, limit_s: float, over: bool) -> InstrumentError:
         if over or isinstance(error, TimeoutError):
             return NoAnswer(
                 f"{self._who}: no answer within {limit_s:.3g} s to {name!r}; check the server and the cable"
@@ -211,8 +211,8 @@ class AlpacaFeatures:
         return self._device.has(name)
 
     def get(self, name: str) -> Setting:
-        found: Setting = self._device.get(name)
-        return found
+        setting: Setting = self._device.get(name)
+        return setting
 
     def set(self, name: str, value: Setting) -> None:
         self._device.put(name, **{self._ARGUMENT.get(name, name.capitalize()): value})

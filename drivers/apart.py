@@ -78,7 +78,7 @@ class Apart:
             pickle.dump((method, arguments), self._process.stdin)
             self._process.stdin.flush()
         except OSError:
-            raise self._died(method) from None
+            raise self._end_and_report(method) from None
         return self._answer(method, timeout_s)
 
     def end(self) -> None:
@@ -103,7 +103,7 @@ class Apart:
                 "next call reconnects"
             ) from None
         if answer is None:
-            raise self._died(doing)
+            raise self._end_and_report(doing)
         ended, value = answer
         if ended == "":
             return value
@@ -112,7 +112,7 @@ class Apart:
         kind = getattr(errors, ended, InstrumentError)
         raise (kind if kind is not errors.Refused else InstrumentError)(value)
 
-    def _died(self, doing: str) -> Disconnected:
+    def _end_and_report(self, doing: str) -> Disconnected:
         assert self._process is not None
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
@@ -146,9 +146,6 @@ def _listen(answers: Any, heard: queue.SimpleQueue[tuple[str, Any] | None]) -> N
         heard.put(None)
 
 
-# --- in the process ---------------------------------------------------------------------------------------------------
-
-
 def _hear(requests: queue.SimpleQueue[Any]) -> None:
     with contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
         while True:
@@ -176,10 +173,10 @@ def _serve(served: str, arguments: list[str]) -> None:
         except InstrumentError as error:
             ended, value = type(error).__name__, str(error)
         except Exception as error:
-            said = " ".join(str(error).split())
-            ended, value = _UNEXPECTED, f"{doing} failed ({type(error).__name__}: {said}); look into its library"
-        told = None if doing == "start" else value
-        pickle.dump((ended, value if ended else told), answers, protocol=pickle.HIGHEST_PROTOCOL)
+            message = " ".join(str(error).split())
+            ended, value = _UNEXPECTED, f"{doing} failed ({type(error).__name__}: {message}); look into its library"
+        result = None if doing == "start" else value
+        pickle.dump((ended, value if ended else result), answers, protocol=pickle.HIGHEST_PROTOCOL)
         answers.flush()
         return None if ended else value
 

@@ -51,7 +51,7 @@ def find_all(usbip: str = "") -> Iterator[Found]:
         yield from usbip_devices(usbip)
     for family, name in drivers():
         if family == "camera":
-            yield from _enumerated(family, name)
+            yield from _enumerate(family, name)
     for port in list_ports.comports():
         if port.vid is not None or port.description not in ("", "n/a"):
             yield Found(port.device, f"serial port: {port.description}")
@@ -61,8 +61,8 @@ def usb_devices() -> Iterator[Found]:
     """Yield the instruments among this computer's USB devices."""
     with suppress(usb.core.USBError, usb.core.NoBackendError):
         for device in usb.core.find(find_all=True):
-            if (found := _usb_device(device, "usb://")) is not None:
-                yield found
+            if (instrument := _usb_device(device, "usb://")) is not None:
+                yield instrument
 
 
 def usbip_devices(server: str) -> Iterator[Found]:
@@ -71,8 +71,8 @@ def usbip_devices(server: str) -> Iterator[Found]:
     where = f"usbip://{host}:{port or DEFAULT_PORT}/"
     try:
         for device in usb.core.find(find_all=True, backend=UsbIpBackend(host, int(port or DEFAULT_PORT))):
-            if (found := _usb_device(device, where)) is not None:
-                yield found
+            if (instrument := _usb_device(device, where)) is not None:
+                yield instrument
     except (usb.core.USBError, ValueError) as error:
         raise Disconnected(
             f"{where}: {in_words(error)}; start a USB/IP server there, or correct the address"
@@ -109,7 +109,7 @@ def _usb_driver(device: usb.core.Device) -> tuple[str, str, tuple[str, ...]]:
     return "", "", ()
 
 
-def _enumerated(family: str, name: str) -> Iterator[Found]:
+def _enumerate(family: str, name: str) -> Iterator[Found]:
     """Yield what a driver's own library lists, where the driver's class has a static method `enumerate_cameras`."""
     try:
         listing = getattr(driver(family, name), "enumerate_cameras", None)

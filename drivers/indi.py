@@ -26,7 +26,7 @@ _PIECE = 1 << 20
 
 @dataclass
 class _Vector:
-    """A property as it was told last: its kind (`Switch`, `Number`, `Text`, `Light`, `BLOB`), state, and values.
+    """A property as it was reported last: its kind (`Switch`, `Number`, `Text`, `Light`, `BLOB`), state, and values.
 
     `updates`: how often it was told; `changes`: of these, as a new value. A server tells definitions to all clients
     when one of them asks.
@@ -135,48 +135,48 @@ class IndiDevice:
             raise self._gone("the server ended it")
         try:
             self._parser.feed(piece)
-            for told in self._parser.read_events():
-                event, found = cast("tuple[str, Element]", told)
+            for event_and_element in self._parser.read_events():
+                event, element = cast("tuple[str, Element]", event_and_element)
                 if self._root is None:
-                    self._root = found
-                elif event == "end" and found in self._root:
-                    self._take(found)
-                    self._root.remove(found)
+                    self._root = element
+                elif event == "end" and element in self._root:
+                    self._take(element)
+                    self._root.remove(element)
         except (ParseError, ValueError, binascii.Error) as error:
             self.close()
             raise Garbled(f"{self._who}: says what isn't INDI ({error}); is an INDI server at this address?") from error
         return True
 
-    def _take(self, told: Element) -> None:
+    def _take(self, message: Element) -> None:
         """A definition, a new value, a message, or the end of a property."""
-        if told.get("device") != self.name:
-            self._others.add(told.get("device") or "")
+        if message.get("device") != self.name:
+            self._others.add(message.get("device") or "")
             self._others.discard("")
             return
-        self._said = told.get("message") or self._said
-        name, tag = told.get("name", ""), told.tag
+        self._said = message.get("message") or self._said
+        name, tag = message.get("name", ""), message.tag
         if tag == "delProperty":
             self._vectors.pop(name, None)
         if not tag.endswith("Vector") or tag[:3] not in ("def", "set"):
             return
         vector = self._vectors.setdefault(name, _Vector(tag[3:-6]))
-        vector.state = told.get("state", vector.state)
+        vector.state = message.get("state", vector.state)
         vector.updates += 1
         vector.changes += tag.startswith("set")
         if tag.startswith("set") and name == self._begun[0]:
             if self._begun[1]:
                 self.forget_blob(self._begun[1])
             self._begun = "", ""
-        for one in told:
-            element, text = one.get("name", ""), (one.text or "").strip()
+        for child in message:
+            element, text = child.get("name", ""), (child.text or "").strip()
             if tag == "setBLOBVector":
                 vector.blob = base64.b64decode(text)
-                vector.values[element] = one.get("format", "")
+                vector.values[element] = child.get("format", "")
                 self._record("received", f"{name} {len(vector.blob)} bytes".encode())
                 continue
             vector.values[element] = text
-            if one.get("min") is not None and one.get("max") is not None:
-                vector.limits[element] = float(one.get("min", 0)), float(one.get("max", 0))
+            if child.get("min") is not None and child.get("max") is not None:
+                vector.limits[element] = float(child.get("min", 0)), float(child.get("max", 0))
         if vector.kind != "BLOB":
             self._record("received", f"{name} {vector.state} {vector.values}".encode())
 
@@ -224,7 +224,7 @@ class IndiDevice:
             self._await("CONNECTION", lambda: are_there() or not is_on())
 
     def await_number(self, name: str, element: str) -> None:
-        """Return once a number is above 0: some are told when it is connected, and are 0 before."""
+        """Return once a number is above 0: some are sent after the connection, and are 0 before."""
         self._await(name, lambda: self.number(name, element) > 0)
 
     def ask(self, name: str) -> None:
@@ -234,20 +234,20 @@ class IndiDevice:
         self._await(name, lambda: self._vector(name).updates > before)
 
     def get(self, name: str) -> Setting:
-        """Return a property's value as it was told last."""
+        """Return a property's last reported value."""
         vector = self._vector(name)
         if vector.kind == "Switch":
-            return next((one for one, value in vector.values.items() if value == "On"), "")
-        return ";".join(f"{one}={value}" for one, value in vector.values.items())
+            return next((name for name, value in vector.values.items() if value == "On"), "")
+        return ";".join(f"{name}={value}" for name, value in vector.values.items())
 
     def number(self, name: str, element: str) -> float:
         """Return a number of a property. Raises `Garbled` where it is none."""
-        told = self._vector(name).values.get(element, "")
+        text = self._vector(name).values.get(element, "")
         try:
-            return float(told)
+            return float(text)
         except ValueError:
             raise Garbled(
-                f"{self._who}: {name} {element} is {told!r}, a number is wanted; look into its driver"
+                f"{self._who}: {name} {element} is {text!r}, a number is wanted; look into its driver"
             ) from None
 
     def text(self, name: str, element: str) -> str:
@@ -274,7 +274,7 @@ class IndiDevice:
         self._refuse_alert(name)
 
     def catch_up(self) -> None:
-        """Take in what was told until now."""
+        """Process the messages that have come."""
         until = time.monotonic() + self._left_s()
         while self._pump(0.0) and time.monotonic() < until:
             continue
@@ -297,7 +297,7 @@ class IndiDevice:
             given = dict(part.partition("=")[::2] for part in str(value).split(";"))
         before, kind = vector.changes, vector.kind
         self._begun = name, picture
-        parts = "".join(f"<one{kind} name={quoteattr(one)}>{text}</one{kind}>" for one, text in given.items())
+        parts = "".join(f"<one{kind} name={quoteattr(element)}>{text}</one{kind}>" for element, text in given.items())
         self._send(f"<new{kind}Vector device={quoteattr(self.name)} name={quoteattr(name)}>{parts}</new{kind}Vector>")
         self._await(name, lambda: name not in self._vectors or self._vectors[name].changes > before)
         if name in self._vectors:
@@ -305,8 +305,10 @@ class IndiDevice:
 
     def _refuse_alert(self, name: str) -> None:
         if name in self._vectors and self.state(name) == "Alert":
-            said = " ".join(self._said.split())[-160:]
-            raise InstrumentError(f"{self._who}: it refuses {name} ({said or 'no reason told'}); look into its driver")
+            message = " ".join(self._said.split())[-160:]
+            raise InstrumentError(
+                f"{self._who}: it refuses {name} ({message or 'no reason stated'}); look into its driver"
+            )
 
     def execute(self, name: str) -> None:
         """Press a property's only button."""

@@ -30,9 +30,9 @@ def read_number(text: str) -> float:
     >>> read_number("+1.5E-3")
     0.0015
     """
-    if re.fullmatch(rf"\s*{_NUMBER}\s*", text) is None or not math.isfinite(found := float(text)):
+    if re.fullmatch(rf"\s*{_NUMBER}\s*", text) is None or not math.isfinite(number := float(text)):
         raise ValueError(f"{text!r} isn't a finite number")
-    return found
+    return number
 
 
 def read_quantity(text: str, unit: str) -> float:
@@ -49,11 +49,11 @@ def read_quantity(text: str, unit: str) -> float:
         return math.nan if first == "NAN" else math.inf
     if _COMMA.fullmatch(text):
         raise ValueError("it may have a decimal comma; set the instrument to decimal points")
-    found = _FIELD.fullmatch(text)
-    if found is None:
+    match = _FIELD.fullmatch(text)
+    if match is None:
         raise ValueError("it isn't a number")
-    value, suffix = float(found["number"]), found["suffix"] or ""
-    if "e" in found["number"].lower() and (state := _STATE.fullmatch(suffix)):  # without an exponent, N is nano
+    value, suffix = float(match["number"]), match["suffix"] or ""
+    if "e" in match["number"].lower() and (state := _STATE.fullmatch(suffix)):  # without an exponent, N is nano
         suffix = state["unit"]
         if state["state"] == "O":
             return math.inf
@@ -62,7 +62,7 @@ def read_quantity(text: str, unit: str) -> float:
     factor = _factor(suffix, unit)
     if abs(value) >= OVERLOAD:
         return math.inf
-    return _scaled(found["number"], factor)
+    return _scale(match["number"], factor)
 
 
 def _factor(suffix: str, unit: str) -> float:
@@ -76,8 +76,8 @@ def _factor(suffix: str, unit: str) -> float:
     raise ValueError(f"its unit is {suffix!r}, not {unit}")
 
 
-def _scaled(number: str, factor: float) -> float:
+def _scale(number: str, factor: float) -> float:
     """Return a number times a power of ten, rounded once."""
     exponent = round(math.log10(factor))
-    mantissa, _, own = number.lower().partition("e")
-    return float(f"{mantissa}e{int(own or 0) + exponent}")
+    mantissa, _, exponent_of_number = number.lower().partition("e")
+    return float(f"{mantissa}e{int(exponent_of_number or 0) + exponent}")

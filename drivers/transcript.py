@@ -43,7 +43,7 @@ def parse(text: str) -> Iterator[list[Piece]]:
                 yield conversation
             conversation = []
         elif line[:2] in {"> ", "< "}:
-            conversation.append(Piece(_MARKS[line[0]], _unescaped(line[2:], number)))
+            conversation.append(Piece(_MARKS[line[0]], _unescape(line[2:], number)))
         elif not line.startswith("#"):
             raise ValueError(
                 f"line {number}: {line[:40]!r} is no piece of a transcript; begin it with '> ', '< ' or '#'"
@@ -68,9 +68,9 @@ class TranscriptFile:
             self._file.close()
 
 
-def _unescaped(text: str, number: int) -> bytes:
-    def one(found: re.Match[bytes]) -> bytes:
-        escape = found[0]
+def _unescape(text: str, number: int) -> bytes:
+    def one(match: re.Match[bytes]) -> bytes:
+        escape = match[0]
         if escape.startswith(b"\\x") and len(escape) == 4:
             return bytes((int(escape[2:], 16),))
         if escape not in _ESCAPES:

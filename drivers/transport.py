@@ -36,7 +36,11 @@ _LONGEST_ANSWER = 1 << 20
 
 
 def shown(data: bytes) -> str:
-    """Bytes as one line of a message: printable ASCII unchanged, the rest escaped, cut at 60 characters."""
+    """Write bytes as one line of a message: printable ASCII unchanged, the rest escaped, cut at 60 characters.
+
+    >>> shown(bytes([79, 75, 13]))
+    "'OK\\\\r'"
+    """
     text = data.decode("latin-1").encode("unicode_escape").decode("ascii")
     return repr(data)[1:] if len(text) <= 60 else f"'{text[:57]}...'"
 
@@ -227,8 +231,8 @@ def _number_of(error: BaseException) -> int | None:
     """Return the system's number of an error; pyserial keeps that of a refused lock in its text alone."""
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno
-    found = re.search(r"\[Errno (\d+)\]", str(error))
-    return int(found[1]) if found else None
+    match = re.search(r"\[Errno (\d+)\]", str(error))
+    return int(match[1]) if match else None
 
 
 class WireInstrument(Instrument):

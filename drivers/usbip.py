@@ -60,9 +60,6 @@ _BUSY_ATTEMPTS, _BUSY_PAUSE_S = 5, 0.03
 _DEVICE_DESCRIPTOR, _CONFIGURATION, _STRING, _INTERFACE, _ENDPOINT = 1, 2, 3, 4, 5
 
 
-# --- descriptors ------------------------------------------------------------------------------------------------------
-
-
 @dataclass
 class Descriptor:
     """A descriptor's fields under pyusb's names."""
@@ -331,9 +328,6 @@ class PipeBackend(IBackend):  # type: ignore[misc]  # pyusb is untyped
         return size
 
 
-# --- the client -------------------------------------------------------------------------------------------------------
-
-
 @dataclass
 class _PendingUrb:
     """A transfer that was submitted to the server, and its answer."""
@@ -421,14 +415,14 @@ class TcpPipe(Pipe):
                 head = receive_exactly(self._socket, URB_HEADER_BYTES)
                 command, number, _, _, _ = HEADER.unpack_from(head)
                 if command == USBIP_RET_SUBMIT:
-                    self._returned(number, head)
+                    self._take_return(number, head)
                 elif command == USBIP_RET_UNLINK:
-                    self._unlinked(number, struct.unpack_from(">i", head, HEADER.size)[0])
+                    self._take_unlinked(number, struct.unpack_from(">i", head, HEADER.size)[0])
                 else:
                     break
         self._fail_all()
 
-    def _returned(self, number: int, head: bytes) -> None:
+    def _take_return(self, number: int, head: bytes) -> None:
         status, length, _, _, _ = RETURN.unpack_from(head, HEADER.size)
         with self._lock:
             urb = self._pending.pop(number, None)
@@ -440,7 +434,7 @@ class TcpPipe(Pipe):
         urb.status = status
         urb.done.set()
 
-    def _unlinked(self, number: int, status: int) -> None:
+    def _take_unlinked(self, number: int, status: int) -> None:
         with self._lock:
             target = self._unlinking.pop(number, 0)
             # status 0: the request had ended, and its own answer has come or comes
@@ -500,15 +494,15 @@ class UsbIpBackend(PipeBackend):
         with self._ask(OP_REQ_DEVLIST) as connection:
             try:
                 (count,) = struct.unpack(">I", receive_exactly(connection, 4))
-                found = []
+                devices = []
                 for _ in range(min(count, 1024)):
                     fields = DEVICE.unpack(receive_exactly(connection, DEVICE.size))
                     receive_exactly(connection, INTERFACE.size * fields[-1])
                     bus_id = fields[1].split(b"\0", 1)[0]
-                    found.append(RemoteDevice(fields[2], fields[3], fields[4], bus_id))
+                    devices.append(RemoteDevice(fields[2], fields[3], fields[4], bus_id))
             except OSError as error:
                 raise failed(errno.EPROTO, f"the list of {self.host}:{self.port} broke off ({error})") from error
-        return found
+        return devices
 
     def open_pipe(self, device: RemoteDevice) -> TcpPipe:
         for attempt in range(_BUSY_ATTEMPTS):
@@ -536,7 +530,7 @@ def find(backend: IBackend | None, serial_number: str) -> usb.core.Device:
 
     Raises `Disconnected` if it isn't there, naming those that are.
     """
-    seen: list[str] = []
+    serial_numbers: list[str] = []
     try:
         candidates = list(usb.core.find(find_all=True, backend=backend))
     except usb.core.NoBackendError as error:
@@ -548,14 +542,14 @@ def find(backend: IBackend | None, serial_number: str) -> usb.core.Device:
         if isinstance(place, bytes) and place.decode("ascii", "replace") == serial_number:
             return device
         try:
-            found = device.serial_number or ""
+            candidate_serial = device.serial_number or ""
         except (usb.core.USBError, ValueError):
             continue  # not ours to read
-        if found == serial_number:
+        if candidate_serial == serial_number:
             return device
-        seen.append(found)
+        serial_numbers.append(candidate_serial)
         usb.util.dispose_resources(device)
-    there = ", ".join(name for name in seen if name) or "none"
+    there = ", ".join(name for name in serial_numbers if name) or "none"
     absent = f"no USB device with serial number {serial_number}; there are: {there}"
     if in_use := getattr(backend, "in_use", 0):
         raise InUse(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.draw import recordings_of
-from evaluation.independent_simulator import LISTED, OUTSIDE, ConcealedCamera, Law
+from evaluation.independent_simulator import LISTED, OUTSIDE, UNLISTED, ConcealedCamera, Law
 from evaluation.own_chain import healthy_session
 from lab.diagnose import diagnose
 from lab.errors import InputError
@@ -19,6 +19,7 @@ from lab.formats.recording_set import RecordingSet, read
 from lab.inference.check import HeldOutCheck, check_held_out, passes
 from lab.inference.posterior import Posterior, Verdict, healthy_nothing, read_table, verdict
 from lab.inference.recordings import measure_side, search_side
+from lab.inference.restated import examine_side
 from lab.inference.search import Table
 from sim.camera import Side
 
@@ -34,7 +35,8 @@ LISTED_PROBABILITY = 0.02
 class Outcome:
     """What the evidence engine says of one side, and the CPU seconds of fit and summaries, and from there to the table.
 
-    `least_nothing`: the p(nothing) that 1 % of healthy draws fall short of."""
+    `least_nothing`: the p(nothing) that 1 % of healthy draws fall short of. `wrong`: statements that are, in
+    sentences."""
 
     side: Side
     said: Verdict
@@ -44,22 +46,27 @@ class Outcome:
     least_nothing: float
     summaries_s: float
     search_s: float
+    wrong: tuple[str, ...] = ()
 
 
 def ask(recordings: RecordingSet, side: Side) -> Outcome | None:
     """Run the evidence engine on one side; None where nothing can be measured."""
+    searched_at: list[float] = []
     begin = time.process_time()
-    problem = measure_side(recordings, side, fit_recording_set)
-    if problem is None:
+    examined = examine_side(
+        recordings, side, fit_recording_set,
+        report=lambda step: searched_at.append(time.process_time()) if step.startswith("searching") else None,
+    )  # fmt: skip
+    if examined.searched is None:
         return None
-    measured = time.process_time()
-    search, table = search_side(problem)
+    problem, search, table = examined.searched.problem, examined.searched.search, examined.searched.table
+    done, measured = time.process_time(), searched_at[-1]
     posterior = read_table(table, search.hypotheses)
-    done = time.process_time()
     least = healthy_nothing(search, DRAWS, RATE, np.random.default_rng(1288))
     checked = check_held_out(problem, search, table)
     said = verdict(posterior, least, passes(checked))
-    return Outcome(side, said, posterior, table, checked, least, measured - begin, done - measured)
+    wrong = tuple(one.check for one in examined.wrong)
+    return Outcome(side, said, posterior, table, checked, least, measured - begin, done - measured, wrong)
 
 
 def lines(outcome: Outcome) -> Iterator[str]:
@@ -67,6 +74,7 @@ def lines(outcome: Outcome) -> Iterator[str]:
     table, posterior = outcome.table, outcome.posterior
     named = ", ".join(f"{f.name} ({f.kind}) {f.probability:.4f}" for f in posterior.named) or "nothing"
     yield f"  {outcome.side}: {outcome.said}; named: {named}"
+    yield from (f"    wrong metadata: {line}" for line in outcome.wrong)
     undecided = ", undecided" if table.is_undecided else ""
     yield (
         f"    p(nothing) {posterior.nothing:.4f} (1 % of healthy draws below {outcome.least_nothing:.3f}); "
@@ -76,7 +84,7 @@ def lines(outcome: Outcome) -> Iterator[str]:
     )
     for row in table.rows[:5]:
         members = ", ".join(sorted(row.members)) or "none"
-        groups = f"; unlisted: {', '.join(table.groups[g] for g in sorted(row.unlisted))}" if row.unlisted else ""
+        groups = f"; unlisted: {', '.join(table.states(row.unlisted))}" if row.unlisted else ""
         yield f"    {row.probability:.4f}  {members}{groups}{'' if row.refitted else ' (closed form)'}"
     for kind in ("effect", "family", "unlisted"):
         found = [f for f in posterior.findings if f.kind == kind and f.probability > LISTED_PROBABILITY]
@@ -117,10 +125,10 @@ def recordings_named(name: str) -> RecordingSet:
 
 
 def _law(name: str) -> type[Law]:
-    for law in (*LISTED, *OUTSIDE):
+    for law in (*LISTED, *OUTSIDE, *UNLISTED):
         if law.name == name:
             return law
-    known = ", ".join(sorted(law.name for law in (*LISTED, *OUTSIDE)))
+    known = ", ".join(sorted(law.name for law in (*LISTED, *OUTSIDE, *UNLISTED)))
     raise InputError(f"law {name!r}: isn't known; choose one of {known}")
 
 

@@ -20,8 +20,8 @@ from typing import Literal
 
 from evaluation.experiment import CaseResult, Experiment, PagePicture, ScoredExperiment
 from evaluation.plots import ABSTAINED, RIGHT, WRONG, Axis, Mark, Row, row_plot
+from lab.bench_process import mock_bench
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
-from lab.cli.bench_process import mock_bench
 from lab.diagnose.visibility import visibility
 from lab.effect_titles import effect_title
 from lab.errors import InputError
@@ -137,6 +137,7 @@ SIZES: dict[str, str] = {
     "adc_nonlinearity": "left:error_dn=4",
     "adc_step": "left:step_dn=3,code_dn=1500",
     "ambient_light": "both:rate_e_per_s=400,red_over_blue=3",
+    "alternating_row_noise": "left:noise_e=3",
     "amplifier_crosstalk": "left:share_percent=2,excess_percent=0.5",
     "amplifier_glow": "left:glow_e_per_s=60,reach_mm=0.5",
     "astigmatism": "left:defocus_x_um=22",
@@ -497,7 +498,7 @@ def session_of(options: Sequence[str], folder: Path) -> DiagnosisResult:
 
 def _command(*arguments: str, data: Path | None = None) -> None:
     environment = dict(os.environ) | ({} if data is None else {"CALIBENCH_DATA": str(data)})
-    command = [sys.executable, "-m", "lab.cli", *arguments]
+    command = [sys.executable, "-m", "calibench", *arguments]
     subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
 
 

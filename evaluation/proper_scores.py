@@ -20,6 +20,7 @@ from evaluation.case_run import CaseRun
 from evaluation.score import SEEN, STRONG, families_of
 from evaluation.truth import CaseTruth
 from lab.formats.results import DiagnosisResult
+from sim.effects.families import Family
 from sim.effects.library import effects as library
 from sim.spectrum import FloatArray
 
@@ -148,12 +149,12 @@ def _families(found: DiagnosisResult | None, told: Mapping[str, float]) -> dict[
     member where sets aren't listed."""
     families: dict[str, float] = {}
     for name, probability in told.items():
-        family = library()[name].family.value
+        family = _family_of(name)
         families[family] = max(families.get(family, 0.0), probability)
     for models in found.models if found is not None else ():
         held: dict[str, float] = {}
         for one in models.sets:
-            for family in {library()[n].family.value for n in one.effects}:
+            for family in {_family_of(n) for n in one.effects}:
                 held[family] = held.get(family, 0.0) + one.probability
         for family, probability in held.items():
             families[family] = max(families.get(family, 0.0), min(probability, 1.0))
@@ -161,6 +162,12 @@ def _families(found: DiagnosisResult | None, told: Mapping[str, float]) -> dict[
         if effect.members:
             families[effect.family] = effect.probability
     return families
+
+
+def _family_of(name: str) -> str:
+    """Return the family's identifier of an effect; of a wrong statement that of metadata."""
+    known = library()
+    return (known[name].family if name in known else Family.METADATA).value
 
 
 def _group(truth: CaseTruth) -> str:

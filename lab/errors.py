@@ -35,6 +35,10 @@ class NoRoom(CannotWrite):
     """A disk is full."""
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: ends a command as Ctrl-C does."""
+
+
 #: What a failure of the environment is mended by, where the system's own words don't say it.
 _REMEDIES = {
     errno.ENOSPC: "make room on that disk, then do it again",

@@ -44,9 +44,6 @@ def _presenter() -> Presenter:
 present_with(_presenter)
 
 
-# --- recordings -------------------------------------------------------------------------------------------------------
-
-
 def open_recordings(
     path: str | Path, kind: str | None = None, *, data: str | Path | None = None, **stated: Any
 ) -> RecordingSet:
@@ -71,7 +68,7 @@ def open_recordings(
     (240, 320)
     """
     from lab.capture.data_folder import existing_store
-    from lab.formats.importers import importers, read_foreign
+    from lab.foreign_recordings import importers, read_foreign
     from lab.formats.importers.single_picture import ImportOptions
     from lab.formats.recording_set import RecordingError, inspect
     from lab.pipeline import source_recordings
@@ -112,9 +109,6 @@ def _as_paths(stated: Mapping[str, Any]) -> dict[str, Any]:
 
 def _opened(recordings: RecordingSet | str | Path) -> RecordingSet:
     return open_recordings(recordings) if isinstance(recordings, str | Path) else recordings
-
-
-# --- calibrate --------------------------------------------------------------------------------------------------------
 
 
 def _run(request: PipelineRequest, progress: bool | None) -> PipelineResult:
@@ -305,9 +299,6 @@ def write_camera(camera: CameraFile, file: str | Path) -> Path:
     return Path(file)
 
 
-# --- predict and simulate ---------------------------------------------------------------------------------------------
-
-
 def predict(
     cameras: Mapping[Side, CameraFile],
     plan: RecordingSet | str | Path,
@@ -465,9 +456,6 @@ def write_frame(simulation: Simulation, file: str | Path) -> Path:
     return path
 
 
-# --- results ----------------------------------------------------------------------------------------------------------
-
-
 def compare(a: FitResult | RecordingSet | str | Path, b: FitResult | RecordingSet | str | Path) -> ComparisonResult:
     """Compare two calibrations: which figures changed beyond their uncertainty.
 
@@ -585,9 +573,6 @@ def write_report(
     return written(file, opened, fit, validation, diagnosis, both=both)
 
 
-# --- certificates, of stored sessions ---------------------------------------------------------------------------------
-
-
 def certify(
     session: str,
     limits: CalibrationLimits | str | Path | None = None,
@@ -647,9 +632,6 @@ a database server's, set CALIBENCH_DATABASE_URL as the service has it
         return write(store, life.calibration(store, session), Path(file))
 
 
-# --- benches ----------------------------------------------------------------------------------------------------------
-
-
 @contextlib.contextmanager
 def mock_bench(*conceal: str) -> Iterator[Path]:
     """Start the mock bench in a process of its own, for the block.
@@ -663,7 +645,7 @@ def mock_bench(*conceal: str) -> Iterator[Path]:
     ...     station.name
     'station.toml'
     """
-    from lab.cli.bench_process import mock_bench as started
+    from lab.bench_process import mock_bench as started
 
     with started(conceal, () if conceal else ("--healthy",)) as station:
         yield station

@@ -81,9 +81,6 @@ def was_removed(kind: Goal | RemovedKind) -> bool:
     return kind in get_args(RemovedKind)
 
 
-# --- the work ---------------------------------------------------------------------------------------------------------
-
-
 class _Reporter:
     """Writes a job's progress to the table, and raises `Cancelled` where someone asked for that."""
 
@@ -218,9 +215,6 @@ def check_scheduler(address: str) -> None:
             "certificates in "
             "Dask's settings (distributed.comm.tls)"
         )
-
-
-# --- the runner -------------------------------------------------------------------------------------------------------
 
 
 class JobRunner:

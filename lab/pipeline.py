@@ -62,9 +62,6 @@ TYPICAL_S: dict[Step, float] = {
 }
 
 
-# --- what is asked for ------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class CaptureRequest:
     """A session to capture: what is left of the session `session`, or a new one where that is empty.
@@ -195,9 +192,6 @@ class PipelineResult(Displayable):
     report: Path | None = None
 
 
-# --- what is evaluated, and on what -----------------------------------------------------------------------------------
-
-
 def session_recordings(store: Store, session_id: str) -> RecordingSet:
     """Return a stored session as a recording set, inspected as a folder would be. Raises InputError where it can't
     be used."""
@@ -288,9 +282,6 @@ def capture_here(
     if cancelled.is_set():
         raise Cancelled
     return session.id
-
-
-# --- the pipeline -----------------------------------------------------------------------------------------------------
 
 
 def run_pipeline(

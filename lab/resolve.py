@@ -81,9 +81,6 @@ def resolve_limits(asked: bool, minutes: float | None = None, rounds: int | None
     return ResolveLimits(minutes, MOST_ROUNDS if rounds is None else rounds)
 
 
-# --- the choice -------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Option:
     """A capture that the station can take, and the lab time (s) that it takes there."""
@@ -131,9 +128,6 @@ def choose(doubt: Doubt, options: Sequence[Option], policy: DecisionPolicy, left
             plans.append(Choice(doubt, one.first, other.first, expected_information(both, doubt.odds)))
     worth = [plan for plan in plans if plan.information_nat >= least]
     return max(worth, key=lambda plan: plan.rate, default=None)
-
-
-# --- the journal ------------------------------------------------------------------------------------------------------
 
 
 def read_journal(folder: Path) -> ResolveJournal | None:
@@ -296,9 +290,6 @@ def _priced(
         except InputError as error:
             lacking.append((capture, str(error)))
     return options, lacking
-
-
-# --- recordings and the station that made them ------------------------------------------------------------------------
 
 
 def resolving_folder(root: Path, recordings: RecordingSet) -> Path:

@@ -191,9 +191,6 @@ class _Work:
             )))  # fmt: skip
 
 
-# --- the process ------------------------------------------------------------------------------------------------------
-
-
 def serve() -> None:
     """Read tasks from standard input until it ends, carry them out, and write progress and findings as pickles to
     standard output."""

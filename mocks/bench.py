@@ -54,7 +54,7 @@ from sim.frame import (
     Kept,
     KeptTransfers,
     SceneLight,
-    collected_electrons,
+    collect_electrons,
     dark_electrons,
     pair_gain_factor,
     read_electrons,
@@ -319,12 +319,12 @@ class Bench:
         if side not in self._truth.cameras:
             raise BenchError(f"no camera {side!r} on this bench: it has {', '.join(self._truth.cameras)}")
         begin_s = self.clock.now() if start_s is None else start_s
-        camera, seen, light = self._seen(side)
+        camera, placed_scene, light = self._seen(side)
         source = self._drift(begin_s + 0.5 * exposure_s)
-        if side == "right" and not (isinstance(seen, UniformField) and seen.kind != "black"):
+        if side == "right" and not (isinstance(placed_scene, UniformField) and placed_scene.kind != "black"):
             source *= pair_gain_factor(camera.model, camera.acting)
         exposure = Exposure(
-            seen,
+            placed_scene,
             exposure_s,
             gain_db,
             self.sensor_temperature_c(side, begin_s + 0.5 * exposure_s),
@@ -332,7 +332,7 @@ class Bench:
         )
         with self._camera_locks[side]:
             source *= unsteady_source(camera.model, camera.acting, exposure.elapsed_s)
-            held = collected_electrons(light, camera.model, exposure, camera.acting, source=source)
+            held = collect_electrons(light, camera.model, exposure, camera.acting, source=source)
             read, self._kept[side] = read_electrons(held, camera.model, exposure, camera.acting, self._kept[side])
             frame = sample_from(
                 read,
@@ -376,22 +376,22 @@ class Bench:
                 if kept is not None:
                     self._lights.move_to_end(key)
                     return camera, *kept
-            seen = scene(camera, placed, light, shown, turn_deg)
+            before_camera = scene(camera, placed, light, shown, turn_deg)
             drawn = scene_light(
                 camera.model,
-                seen,
+                before_camera,
                 camera.acting,
-                oversample=SCREEN_OVERSAMPLE if isinstance(seen, ScreenPattern) else OVERSAMPLE,
+                oversample=SCREEN_OVERSAMPLE if isinstance(before_camera, ScreenPattern) else OVERSAMPLE,
                 margin_px=MARGIN_PX,
                 transfers=transfers,
             )
             with self._lock:
-                self._lights[key] = seen, drawn
+                self._lights[key] = before_camera, drawn
                 while len(self._lights) > _MOST_CACHED:
                     self._lights.popitem(last=False)
-        if isinstance(seen, ScreenPattern):
+        if isinstance(before_camera, ScreenPattern):
             return_freed_memory()  # many follow each other, and each takes 200 MB for a moment
-        return camera, seen, drawn
+        return camera, before_camera, drawn
 
     def _camera(self, side: Side, stop: str) -> HiddenCamera:
         """Return a camera with its lens at a stop of `STOPS`."""

@@ -319,7 +319,7 @@ def bench(
     """
     with _one_line_errors():
         faults = _bench_faults(fault or [])
-        concealed = _concealed(conceal or [], healthy)
+        concealed = _parse_concealed(conceal or [], healthy)
         stop = threading.Event()
         with _ended_by_signals(stop), contextlib.ExitStack() as running:
             line = _BenchLine(host, advertise or host, serial_over_tcp, display)
@@ -361,16 +361,16 @@ class _BenchLine:
         return self.display, {"driver": "browser", "address": f"0.0.0.0:{port}", "allow_remote": True}
 
 
-def _concealed(specs: list[str], healthy: bool) -> Concealed | None:
+def _parse_concealed(specs: list[str], healthy: bool) -> Concealed | None:
     """Return the effects to conceal, from the command line, else from the environment; None: the bench's default
     ones."""
     from mocks.conceal import ConcealError, parse
 
-    told = specs or [part for part in os.environ.get(CONCEAL_VARIABLE, "").split(";") if part.strip()]
-    if healthy and told:
+    stated = specs or [part for part in os.environ.get(CONCEAL_VARIABLE, "").split(";") if part.strip()]
+    if healthy and stated:
         raise _Unusable("bench: --healthy conceals nothing; leave out --conceal, or --healthy")
     try:
-        return parse(told) if told or healthy else None
+        return parse(stated) if stated or healthy else None
     except ConcealError as error:
         raise _Unusable(str(error)) from error
 
@@ -458,9 +458,6 @@ def _thread(running: contextlib.ExitStack, name: str, work: Callable[[], None]) 
     running.callback(thread.join, 5.0)
 
 
-# --- the station file -------------------------------------------------------------------------------------------------
-
-
 def station_toml(addresses: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any]) -> str:
     """Return the station file (TOML): an address a table, the cameras' data sheets, the targets' nominal layout."""
     tables: dict[str, Any] = {"name": "mock bench", "cameras": {}}
@@ -516,9 +513,6 @@ def _write(path: Path, text: str) -> None:
         raise _Unusable(
             f"{path}: can't be written ({error.strerror}); give a path in a folder that is there"
         ) from error
-
-
-# --- the process ------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager

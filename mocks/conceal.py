@@ -40,17 +40,17 @@ class ConcealError(ValueError):
 def parse(specs: Iterable[str]) -> Concealed:
     """Effects by side. Raises `ConcealError` that names the effect, the parameter or the limit, and what may be
     chosen."""
-    found: dict[Side, tuple[Effect, ...]] = {"left": (), "right": ()}
+    by_side: dict[Side, tuple[Effect, ...]] = {"left": (), "right": ()}
     for spec in specs:
-        sides, effect = _parsed(spec.strip())
+        sides, effect = _parse(spec.strip())
         for side in sides:
-            if any(type(other) is type(effect) for other in found[side]):
+            if any(type(other) is type(effect) for other in by_side[side]):
                 raise ConcealError(f"--conceal {spec}: {effect.name} is concealed on the {side} already; give it once")
-            found[side] = (*found[side], effect)
-    return found
+            by_side[side] = (*by_side[side], effect)
+    return by_side
 
 
-def _parsed(spec: str) -> tuple[tuple[Side, ...], Effect]:
+def _parse(spec: str) -> tuple[tuple[Side, ...], Effect]:
     where, _, rest = spec.partition(":")
     name, _, text = rest.partition(":")
     sides: tuple[Side, ...] = SIDES if where == "both" else tuple(side for side in SIDES if side == where)
@@ -94,14 +94,14 @@ def _made(spec: str, kind: type[Effect], text: str) -> Effect:
     except ValidationError as error:
         first = error.errors()[0]
         field = str(first["loc"][0]) if first["loc"] else ""
-        said = str(first["msg"]).removeprefix("Value error, ")
-        if field in quantities and not said.startswith(quantities[field].meaning):
+        problem = str(first["msg"]).removeprefix("Value error, ")
+        if field in quantities and not problem.startswith(quantities[field].meaning):
             unit = quantities[field].unit
-            said = (
+            problem = (
                 f"{values[field]!r} is no number; give one{'' if unit == '1' else f', which is in {unit}'}, without a "
                 "unit"
             )
-        raise ConcealError(f"--conceal {spec}: {' '.join((kind.name, field)).strip()}: {said}") from None
+        raise ConcealError(f"--conceal {spec}: {' '.join((kind.name, field)).strip()}: {problem}") from None
     if effect == kind():
         raise ConcealError(f"--conceal {spec}: nothing of {kind.name} would be there; give a value of {known}")
     return effect

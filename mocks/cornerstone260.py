@@ -161,9 +161,9 @@ class MockCornerstone260(Grammar):
         if code is not None:
             raise _Cs260Refusal(code)
         for pattern, action in self._grammar:
-            found = re.fullmatch(pattern, statement)
-            if found:
-                return action(self, *found.groups())
+            match = re.fullmatch(pattern, statement)
+            if match:
+                return action(self, *match.groups())
         name = re.match(r"[A-Z]+\d?[A-Z]*", statement)
         if name and name[0] in self._known:
             raise _Cs260Refusal(BAD_PARAMETER)

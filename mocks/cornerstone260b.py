@@ -235,11 +235,11 @@ class MockCornerstone260B(UsbDevice):
             self._set(word, float(argument == "O"))
         elif word in self._settings or word == "GRAT":
             self._set("GRATING" if word == "GRAT" else word, _number(argument))
-        elif found := re.fullmatch(r"SLIT([123])MICRONS", word):
+        elif match := re.fullmatch(r"SLIT([123])MICRONS", word):
             width_um = _number(argument)
             if not 4.0 <= width_um <= 3000.0:
                 raise _Cs260bRefusal(_OUT_OF_RANGE)
-            self._begin_motion(0.5, lambda: self._set_slit(int(found[1]), width_um))
+            self._begin_motion(0.5, lambda: self._set_slit(int(match[1]), width_um))
         elif word not in ("*CLS", "*RST", "*OPC", "*WAI"):
             raise _Cs260bRefusal(_UNKNOWN)
         if word == "*CLS":
@@ -267,10 +267,10 @@ class MockCornerstone260B(UsbDevice):
             return f"CS260B SN {self.identity.serial_number}"
         if what == "GRAT":
             return f"{self._settings['GRATING']:.0f},{1200 if self._settings['GRATING'] == 1 else 600},VIS"
-        if found := re.fullmatch(r"SLIT([123])MICRONS", what):
-            return f"{self._slits_um[int(found[1])]:.0f}"
-        if found := re.fullmatch(r"FILTER([1-6])LABEL", what):
-            return f"FILTER{found[1]}"
+        if match := re.fullmatch(r"SLIT([123])MICRONS", what):
+            return f"{self._slits_um[int(match[1])]:.0f}"
+        if match := re.fullmatch(r"FILTER([1-6])LABEL", what):
+            return f"FILTER{match[1]}"
         if what in self._settings:
             return f"{self._settings[what]:.0f}"
         raise _Cs260bRefusal(_UNKNOWN)
@@ -279,8 +279,8 @@ class MockCornerstone260B(UsbDevice):
         """`error?` and `stb?` as the RS-232 port has them, the event register of IEEE 488.2; reading clears."""
         with self.changed:
             if what == "*ESR":
-                told, self._events = self._events, 0
-                return str(told)
+                events, self._events = self._events, 0
+                return str(events)
             if what in ("STB", "*STB"):
                 return "20" if self._errors else "00"
             last, self._errors = (list(self._errors) or [""])[-1], deque()

@@ -99,9 +99,9 @@ class ColorimetryResearch(Grammar):
         if command == "E":
             self._echo = not self._echo
             return None
-        if found := re.fullmatch(r"SM (\w+) (-?\d{1,7})", command):
-            return self._set(command, found[1], int(found[2]))
-        if found := re.fullmatch(r"R[CSM] \w+", command):
+        if match := re.fullmatch(r"SM (\w+) (-?\d{1,7})", command):
+            return self._set(command, match[1], int(match[2]))
+        if match := re.fullmatch(r"R[CSM] \w+", command):
             return self._get(command)
         return _error(INVALID_COMMAND, command)
 
@@ -114,7 +114,7 @@ class ColorimetryResearch(Grammar):
         return _ok(f"SM {name}", "No errors")
 
     def _get(self, command: str) -> Reply:
-        told = {
+        answers = {
             "RC ID": self._serial_number,
             "RC Model": self._model,
             "RC Firmware": "1.23",
@@ -126,8 +126,8 @@ class ColorimetryResearch(Grammar):
             "RS SyncFreq": f"{self._settings['SyncFreq']:.2f} Hz",
             "RM Warnings": "0",
         }
-        if command in told:
-            return _ok(command, told[command])
+        if command in answers:
+            return _ok(command, answers[command])
         if command not in {
             "RM Spectrum",
             "RM XYZ",

@@ -79,11 +79,11 @@ class MockCs2000(Grammar):
     def _tell(self, command: str) -> Reply:
         if command == "IDDR":
             return _ok("CS-2000", "0", self._serial_number)
-        if found := re.fullmatch(r"RMTS,([01])", command):
-            self._remote = found[1] == "1"
+        if match := re.fullmatch(r"RMTS,([01])", command):
+            self._remote = match[1] == "1"
             return _ok()
-        if (found := re.fullmatch(r"MEDR,1,0,0?([1-4])", command)) and self._remote:
-            first = 100 * (int(found[1]) - 1)
+        if (match := re.fullmatch(r"MEDR,1,0,0?([1-4])", command)) and self._remote:
+            first = 100 * (int(match[1]) - 1)
             piece = self._values[first : first + (101 if first == 300 else 100)]
             return _ok(*piece) if piece else _error(NO_DATA)
         return _error(INVALID)

@@ -97,22 +97,22 @@ def browse(page: Page, address: str, stop: threading.Event, faults: Iterable[Fau
             with connect(
                 f"ws://{address}/ws", open_timeout=5, max_size=1 << 24, compression=None, proxy=None
             ) as socket:
-                for said in page.opened():
-                    socket.send(said)
+                for answer in page.opened():
+                    socket.send(answer)
                 while not stop.is_set():
                     try:
                         message = socket.recv(timeout=0.05)
                     except TimeoutError:
                         continue
-                    for said in page.receive(message):
+                    for answer in page.receive(message):
                         answers += 1
-                        if not _answer(socket, said, broken.of(answers), stop):
+                        if not _answer(socket, answer, broken.of(answers), stop):
                             break
         except (OSError, WebSocketException):
             stop.wait(RETRY_S)
 
 
-def _answer(socket: ClientConnection, said: str, faults: list[Fault], stop: threading.Event) -> bool:
+def _answer(socket: ClientConnection, answer: str, faults: list[Fault], stop: threading.Event) -> bool:
     """Send an answer as the faults will have it; False once the page is gone."""
     for fault in faults:
         if fault.kind == "late":
@@ -120,15 +120,17 @@ def _answer(socket: ClientConnection, said: str, faults: list[Fault], stop: thre
         elif fault.kind in {"never", "drop"}:
             return True
         elif fault.kind == "half":
-            said = said[: len(said) // 2]
+            answer = answer[: len(answer) // 2]
         elif fault.kind == "wrong":
-            said = json.dumps({"type": "error"})
+            answer = json.dumps({"type": "error"})
         elif fault.kind == "error":
-            said = json.dumps({**json.loads(said), "type": "refused", "reason": "the page isn't full-screen any more"})
+            answer = json.dumps(
+                {**json.loads(answer), "type": "refused", "reason": "the page isn't full-screen any more"}
+            )
         elif fault.kind == "unplug":
             with contextlib.suppress(OSError):
                 socket.close()
             stop.wait(1.0 if fault.value is None else min(fault.value, threading.TIMEOUT_MAX))
             return False
-    socket.send(said)
+    socket.send(answer)
     return True

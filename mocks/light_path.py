@@ -162,7 +162,7 @@ def misread(camera: CameraModel, radiance: Spectrum, effects: Sequence[Effect], 
         wavelength_nm, value = radiance.arrays
         peak, level = float(value.max()), 1.0
         for _ in range(LEVEL_STEPS if peak > 0 else 0):
-            seen = radiance_at_lens(camera, Spectrum.of(wavelength_nm, value * level), [effect], kind)
-            level *= peak / max(seen.value)
+            at_lens = radiance_at_lens(camera, Spectrum.of(wavelength_nm, value * level), [effect], kind)
+            level *= peak / max(at_lens.value)
         radiance = Spectrum.of(wavelength_nm, value * level)
     return radiance

@@ -85,10 +85,10 @@ class MockPe4000(Grammar):
             return known[command]()
         if command.startswith("CSS"):
             return self._set(command[3:])
-        if (found := re.fullmatch(r"LOAD:(\d{3})", command)) and any(int(found[1]) in leds for leds in LEDS.values()):
+        if (match := re.fullmatch(r"LOAD:(\d{3})", command)) and any(int(match[1]) in leds for leds in LEDS.values()):
             if self._done_at is not None:
                 self._end()
-            self._arriving, self._done_at = int(found[1]), self.clock.now() + _LOAD_S
+            self._arriving, self._done_at = int(match[1]), self.clock.now() + _LOAD_S
             self._shine()
             return [command]
         return []
@@ -102,5 +102,5 @@ class MockPe4000(Grammar):
         return [self._css()]
 
     def _css(self) -> str:
-        told = (f"{letter}{selected}{on}{percent:03d}" for letter, (selected, on, percent) in self.state.items())
-        return f"CSS{''.join(told)}"
+        states = (f"{letter}{selected}{on}{percent:03d}" for letter, (selected, on, percent) in self.state.items())
+        return f"CSS{''.join(states)}"

@@ -295,10 +295,10 @@ class VikyCamera(RealInstrument):
     """
 
     def __init__(self) -> None:
-        found = find_spec("genicam")
-        if found is None or found.origin is None:
+        spec = find_spec("genicam")
+        if spec is None or spec.origin is None:
             raise InstrumentError("GenTL cameras: genicam isn't installed; install calibench[gentl]")
-        producer = Path(found.origin).with_name("viky.cti")
+        producer = Path(spec.origin).with_name("viky.cti")
         if not producer.is_file():
             raise InstrumentError(f"{producer} isn't there: this build of genicam has no producer")
         description = Path(__file__).with_name("viky.xml")
@@ -375,8 +375,8 @@ class AravisFakeCamera(ProcessPeer):
 
 def _free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as probe:
-        found: int = probe.getsockname()[1]
-        return found
+        port: int = probe.getsockname()[1]
+        return port
 
 
 #: What the Alpaca simulators are like, as somebody left them: binned.
@@ -450,7 +450,7 @@ class IndiSimulator(ProcessPeer):
                 ("SIMULATOR_SETTINGS", {"SIM_XRES": 512, "SIM_YRES": 512}),
                 ("POLLING_PERIOD", {"PERIOD_MS": 10}),
             ):
-                ones = "".join(f"<oneNumber name='{one}'>{value}</oneNumber>" for one, value in numbers.items())
+                ones = "".join(f"<oneNumber name='{name}'>{value}</oneNumber>" for name, value in numbers.items())
                 line.sendall(f"<newNumberVector device='CCD Simulator' name='{name}'>{ones}</newNumberVector>".encode())
             time.sleep(0.2)
         return True
@@ -542,8 +542,8 @@ class DemoCamera(LibraryPeer):
     """Micro-Manager's DemoCamera, of the package mm-test-adapters."""
 
     def __init__(self) -> None:
-        found = find_spec("mm_test_adapters")
-        if found is None or found.origin is None or find_spec("pymmcore_plus") is None:
+        spec = find_spec("mm_test_adapters")
+        if spec is None or spec.origin is None or find_spec("pymmcore_plus") is None:
             raise InstrumentError("Micro-Manager cameras: mm-test-adapters isn't installed; install calibench[peers]")
         self._folder = tempfile.TemporaryDirectory(prefix="calibench-peer-")
         file = Path(self._folder.name) / "demo.cfg"
@@ -552,7 +552,7 @@ class DemoCamera(LibraryPeer):
             "drivers.camera.micromanager:Core",
             file,
             f"{file}#Camera",
-            adapters=str(Path(found.origin).with_name("libs")),
+            adapters=str(Path(spec.origin).with_name("libs")),
             timeout_s=3.0,
             connect_timeout_s=20.0,
         )

@@ -104,12 +104,12 @@ class PhotoResearch(Grammar):
 
     def _obey(self, command: str) -> bytes:
         answer = _quality(_BAD_COMMAND)
-        if found := re.fullmatch(r"M(\d{1,3})", command):
-            self._measure(int(found[1]))
+        if match := re.fullmatch(r"M(\d{1,3})", command):
+            self._measure(int(match[1]))
             answer = b""
-        elif found := re.fullmatch(r"D(\d{1,3})", command):
+        elif match := re.fullmatch(r"D(\d{1,3})", command):
             code = self._failure()
-            answer = _quality(code) if code is not None else self._data(int(found[1]))
+            answer = _quality(code) if code is not None else self._data(int(match[1]))
         elif command in {"E", "C"}:
             self._echo ^= command == "E"
             self._quality *= command == "E"
@@ -117,8 +117,8 @@ class PhotoResearch(Grammar):
         elif command == "F":
             answer = b"0000,0.00 Hertz (Period = 0 milliseconds)\r\n"
         elif re.fullmatch(r"(?:I|B\d{1,3}|S[A-Z]?[-\d,.]*|L.{0,20})", command):
-            if found := re.fullmatch(r"SS([013])", command):
-                self._sync = int(found[1])
+            if match := re.fullmatch(r"SS([013])", command):
+                self._sync = int(match[1])
             answer = b"0000\r\n"
         return answer
 

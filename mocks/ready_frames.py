@@ -101,17 +101,17 @@ class ReadyFrames:
     def of_folder(cls, folder: Path, sides: Sequence[Side]) -> ReadyFrames:
         """Return the frames `*-left.npy` and `*-right.npy` of a folder (a session's `frames`), by name. Raises
         ValueError, one line."""
-        found: dict[Side, list[UInt16Array]] = {}
+        frames: dict[Side, list[UInt16Array]] = {}
         for side in sides:
-            found[side] = []
+            frames[side] = []
             for file in sorted(folder.glob(f"*-{side}.npy")):
                 try:
-                    found[side].append(np.load(file, mmap_mode="r", allow_pickle=False))
+                    frames[side].append(np.load(file, mmap_mode="r", allow_pickle=False))
                 except (OSError, ValueError) as error:
                     raise ValueError(f"{file}: can't be read ({error}); name a folder of raw frames") from error
-            if not found[side]:
+            if not frames[side]:
                 raise ValueError(f"{folder}: holds no *-{side}.npy; name a session's folder `frames`")
-        return cls(found)
+        return cls(frames)
 
     def sensor(self, side: Side) -> tuple[int, int, float]:
         rows, cols = self._shapes[side]

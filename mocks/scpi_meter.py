@@ -28,9 +28,11 @@ def calibration_csv(departure_percent: float = 0.8) -> str:
     """Return the calibration that came with the diode; `departure_percent` is by how much it is off, as real ones
     are."""
     at = np.arange(300.0, 1101.0, 10.0)
-    told = responsivity_a_per_w(at) * (1.0 + departure_percent / 100.0 * np.sin(at / 180.0))
+    certified = responsivity_a_per_w(at) * (1.0 + departure_percent / 100.0 * np.sin(at / 180.0))
     return (
-        "\n".join(["wavelength_nm,responsivity_a_per_w", *(f"{w:.0f},{r:.6f}" for w, r in zip(at, told, strict=True))])
+        "\n".join(
+            ["wavelength_nm,responsivity_a_per_w", *(f"{w:.0f},{r:.6f}" for w, r in zip(at, certified, strict=True))]
+        )
         + "\n"
     )
 
@@ -131,7 +133,7 @@ class MockScpiMeter(Grammar):
         """Return the answer to a command that IEEE 488.2 asks of every instrument; None: it isn't one that is known."""
         events = self._events
         status = (_ERRORS_THERE if self._errors else 0) | (_EVENTS_THERE if events & self._events_enabled else 0)
-        told = {
+        answers = {
             "*IDN?": f"KEITHLEY INSTRUMENTS INC.,MODEL 6485,{self._serial_number},B03",
             "*OPC?": "1",  # a reading is waited for before the next command is obeyed
             "*STB?": str(status),
@@ -150,18 +152,18 @@ class MockScpiMeter(Grammar):
             self._events |= _OPERATION_COMPLETE
         elif command.startswith("*ESE ") and command[5:].strip().isdigit():
             self._events_enabled = int(command[5:]) & 0xFF
-        elif command not in told and command != "*WAI" and not command.startswith("*SRE "):
+        elif command not in answers and command != "*WAI" and not command.startswith("*SRE "):
             return None
-        return told[command].encode() + b"\n" if command in told else b""
+        return answers[command].encode() + b"\n" if command in answers else b""
 
     def _reading(self) -> bytes:
         current_a = 0.0 if self._zero_check else DARK_A + self._photocurrent()
         current_a += NOISE_A * float(self._rng.standard_normal())
-        told = current_a if abs(current_a) <= _RANGE_A else 9.9e37
-        return f"{told:+.6E}A,{self.clock.now() % 1e5:+.6E},{0:+.6E}\n".encode()
+        reading = current_a if abs(current_a) <= _RANGE_A else 9.9e37
+        return f"{reading:+.6E}A,{self.clock.now() % 1e5:+.6E},{0:+.6E}\n".encode()
 
     def _photocurrent(self) -> float:
         """Area x solid angle x the integral of radiance x responsivity."""
         wavelength_nm = np.arange(340.0, 1100.5, 1.0)
-        seen = self._light.radiance().at(wavelength_nm) * responsivity_a_per_w(wavelength_nm)
-        return AREA_M2 * SOLID_ANGLE_SR * float(np.sum(seen))
+        current_spectrum = self._light.radiance().at(wavelength_nm) * responsivity_a_per_w(wavelength_nm)
+        return AREA_M2 * SOLID_ANGLE_SR * float(np.sum(current_spectrum))

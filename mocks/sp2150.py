@@ -58,15 +58,15 @@ class MockSp2150(Grammar):
         out: list[bytes] = []
         while self._waiting and self._done_at is None:
             command = self._waiting.popleft()
-            told = self._told(command) if self._failure() is None else None
-            if told is not None:
-                out.append(self._said(command, told))
+            text = self._told(command) if self._failure() is None else None
+            if text is not None:
+                out.append(self._said(command, text))
             elif self._done_at is None:
                 out.append(Reply(f"{command if self._echo else ''}  ? \r\n".encode("latin-1", "replace")))
         return out
 
-    def _said(self, command: str, told: str) -> Reply:
-        return Reply(f"{command if self._echo else ''} {told} ok\r\n".encode("latin-1", "replace"))
+    def _said(self, command: str, text: str) -> Reply:
+        return Reply(f"{command if self._echo else ''} {text} ok\r\n".encode("latin-1", "replace"))
 
     def _told(self, command: str) -> str | None:
         """Return the answer; None where there is none yet (a motion), or none at all."""
@@ -80,13 +80,13 @@ class MockSp2150(Grammar):
         }
         if command in known:
             return known[command]
-        if (found := re.fullmatch(rf"{_NUMBER} GOTO", command)) and (nm := float(found[1])) <= _UPPER_NM:
+        if (match := re.fullmatch(rf"{_NUMBER} GOTO", command)) and (nm := float(match[1])) <= _UPPER_NM:
             self._go(command, 0.05 + abs(nm - self._nm) / _NM_PER_S, lambda: self._stand(nm))
-        elif found := re.fullmatch(r"([1-6]) FILTER", command):
-            place = int(found[1])
+        elif match := re.fullmatch(r"([1-6]) FILTER", command):
+            place = int(match[1])
             self._go(command, 0.05 + _S_PER_PLACE * abs(place - self._filter), lambda: self._turn(place))
-        elif found := re.fullmatch(r"([12]) GRATING", command):
-            number = int(found[1])
+        elif match := re.fullmatch(r"([12]) GRATING", command):
+            number = int(match[1])
             self._go(command, 10.0, lambda: setattr(self, "_grating", number))
         return None
 

@@ -125,9 +125,9 @@ class MockSpecbos1211(Grammar):
         words = " ".join(command.lower().split())
         try:
             for pattern, action in self._grammar:
-                found = re.fullmatch(pattern, words)
-                if found:
-                    return [Reply(self._answer(words, action, found.groups()))]
+                match = re.fullmatch(pattern, words)
+                if match:
+                    return [Reply(self._answer(words, action, match.groups()))]
         except _SpecbosRefusal as refusal:
             self._error = refusal.code
             return [Reply(NAK)]

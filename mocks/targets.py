@@ -183,13 +183,13 @@ def _edges(name: str, camera: HiddenCamera) -> tuple[PlaneEdge, ...]:
     """Return the edges of one knife-edge target, each a little off the middle of its place, as blades are."""
     scale = mm_per_px(camera)
     off = {"centre": (0.31, -0.52), "mid": (-0.77, 0.28), "corner": (0.55, 0.93)}
-    found = []
+    targets = []
     for place, share in EDGE_PLACES.items():
         down, across = (camera.model.rows * part for part in share)
         centre = across * scale, down * scale
         through = (across + off[place][0]) * scale, (down + off[place][1]) * scale
-        found.append(PlaneEdge(centre, through, EDGE_ANGLES_DEG[name] + 0.15))
-    return tuple(found)
+        targets.append(PlaneEdge(centre, through, EDGE_ANGLES_DEG[name] + 0.15))
+    return tuple(targets)
 
 
 def scene(camera: HiddenCamera, placed: str, light: LightSettings, shown: ShownCells, turn_deg: float = 0.0) -> Scene:
@@ -245,9 +245,6 @@ def corners_px(warp: Warp, width: float, height: float) -> FloatArray:
     """[row, col] of the corners (0, 0), (width, 0), (width, height), (0, height) of a target's plane."""
     row, col = warp.to_camera(np.array([0.0, width, width, 0.0]), np.array([0.0, 0.0, height, height]))
     return np.stack([row, col], axis=1)
-
-
-# --- what a lab knows -------------------------------------------------------------------------------------------------
 
 
 def station_targets(cameras: Mapping[Side, HiddenCamera]) -> dict[str, Any]:

@@ -71,8 +71,8 @@ class TetheredCamera:
 
     def shoot(self) -> None:
         """Take one picture and write it."""
-        told = self.folder / ".exposure"
-        exposure_s = float(told.read_text()) if told.is_file() else 0.01
+        exposure_file = self.folder / ".exposure"
+        exposure_s = float(exposure_file.read_text()) if exposure_file.is_file() else 0.01
         raw = self._bench.expose(self._side, exposure_s)
         self._pictures += 1
         kinds = {fault.kind: fault for fault in self._faults if fault.hits(self._pictures)}

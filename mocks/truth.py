@@ -188,9 +188,12 @@ def _pattern(
 ) -> FixedPattern:
     """Pattern noise with the stated standard deviations. White, as the data sheet's figures mean it, or with a tenth of
     the PRNU's variance shared by neighbours and a fiftieth of the DSNU's by columns."""
-    own, shared = rng.standard_normal(shape), ndimage.gaussian_filter(rng.standard_normal(shape), 1.0, mode="wrap")
+    independent, shared = (
+        rng.standard_normal(shape),
+        ndimage.gaussian_filter(rng.standard_normal(shape), 1.0, mode="wrap"),
+    )
     dark, columns = rng.standard_normal(shape), rng.standard_normal((1, shape[1]))
-    prnu = own if white else np.sqrt(0.9) * own + np.sqrt(0.1) * shared / shared.std()
+    prnu = independent if white else np.sqrt(0.9) * independent + np.sqrt(0.1) * shared / shared.std()
     dsnu = dark if white else np.sqrt(0.98) * dark + np.sqrt(0.02) * columns
     prnu, dsnu = prnu - prnu.mean(), dsnu - dsnu.mean()
     return FixedPattern(prnu=prnu / prnu.std() * prnu_percent / 100.0, dsnu_e=dsnu / dsnu.std() * dsnu_e)

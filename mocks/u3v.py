@@ -116,9 +116,6 @@ FAULTS = {
 _OF_FRAMES = ("late", "never", "short", "lost-trailer", "damaged", "torn", "repeated", "missed", "unplug", "halt")
 
 
-# --- the camera's XML -------------------------------------------------------------------------------------------------
-
-
 def _xml(rows: int, cols: int) -> bytes:
     """Return the camera's description of itself, with this sensor's size and the addresses above filled in."""
     places = {name: f"{value:#x}" for name, value in globals().items() if name.isupper() and isinstance(value, int)}
@@ -133,7 +130,7 @@ def _xml(rows: int, cols: int) -> bytes:
     ).encode()
 
 
-def _zipped(xml: bytes) -> bytes:
+def _zip(xml: bytes) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(zipfile.ZipInfo("MockU3V_v1.0.2.xml"), xml, zipfile.ZIP_DEFLATED)
@@ -147,9 +144,6 @@ def _float_of(bits: int) -> float:
 
 def _float_bits(value: float) -> int:
     return int(struct.unpack("<I", struct.pack("<f", value))[0])
-
-
-# --- the device -------------------------------------------------------------------------------------------------------
 
 
 class TriggerLine:
@@ -269,7 +263,7 @@ class U3vDevice(UsbDevice):
         sirm = bytearray(0x30)
         struct.pack_into("<I", sirm, 0x00, 2 << 24)  # transfers are multiples of 4 bytes
         struct.pack_into("<II", sirm, 0x10, 52, 32)
-        archive = _zipped(_xml(self._rows, self._cols))
+        archive = _zip(_xml(self._rows, self._cols))
         manifest = struct.pack("<Q", 1) + struct.pack(
             "<IIQQ20s20x", 0x0100_0002, 1 << 24 | 1 << 16 | 1 << 10, XML, len(archive), hashlib.sha1(archive).digest()
         )
@@ -553,12 +547,12 @@ class U3vDevice(UsbDevice):
         while (start_s := self._next_start()) is not None:
             exposure_s = self._get(EXPOSURE_TICKS) / TICKS_PER_US * 1e-6
             raw = self._bench.expose(self.side, exposure_s, _float_of(self._get(GAIN)), start_s)
-            self._send(self._processed(raw), start_s)
+            self._send(self._process(raw), start_s)
             if self._get(ACQUISITION_MODE) == 1:
                 with self.changed:
                     self._acquiring = False
 
-    def _processed(self, raw: UInt16Array) -> UInt16Array:
+    def _process(self, raw: UInt16Array) -> UInt16Array:
         """Return what the camera makes of the converter's codes: channel by channel times its white balance and its
         preset for the light."""
         if self._get(TEST_PATTERN):

@@ -66,9 +66,6 @@ def backend(name: str, bench: Bench | None = None) -> InProcessBackend:
     return InProcessBackend(devices(name, bench))
 
 
-# --- in this process --------------------------------------------------------------------------------------------------
-
-
 class InProcessPipe(Pipe):
     """Calls a device model directly."""
 
@@ -105,7 +102,6 @@ class InProcessBackend(PipeBackend):
         return InProcessPipe(device.place)
 
 
-# --- over USB/IP ------------------------------------------------------------------------------------------------------
 # The layouts are written out here a second time on purpose: a mistake shared with the client would not be seen.
 
 _VERSION = 0x0111
@@ -114,13 +110,13 @@ _MOST_TRANSFER = 64 * 1024 * 1024
 
 
 def _usb_device_bytes(bus_id: str, number: int, device: UsbDevice) -> bytes:
-    one = device.identity
+    identity = device.identity
     return (
         f"/sys/devices/calibench/usb1/{bus_id}".encode().ljust(256, b"\0")
         + bus_id.encode().ljust(32, b"\0")
         + struct.pack(">III", 1, number, device.speed)
-        + struct.pack(">HHH", one.vendor_id, one.product_id, one.release)
-        + bytes([*one.device_class, 1, 1, len(device.interfaces)])
+        + struct.pack(">HHH", identity.vendor_id, identity.product_id, identity.release)
+        + bytes([*identity.device_class, 1, 1, len(device.interfaces)])
     )
 
 

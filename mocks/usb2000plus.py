@@ -51,8 +51,8 @@ def calibration_csv(departure_percent: float = 0.0) -> str:
     expanded uncertainty that calibration laboratories state for spectral radiance).
     """
     at = np.arange(350.0, 1001.0, 2.0)
-    told = response(at) * (1.0 + departure_percent / 100.0 * np.sin(at / 90.0))
-    rows = [f"{w:.1f},{r:.6e}" for w, r in zip(at, told, strict=True)]
+    certified = response(at) * (1.0 + departure_percent / 100.0 * np.sin(at / 90.0))
+    rows = [f"{w:.1f},{r:.6e}" for w, r in zip(at, certified, strict=True)]
     return "\n".join(["wavelength_nm,counts_per_s_per_w_sr_m2_nm", *rows]) + "\n"
 
 
@@ -146,9 +146,9 @@ class MockUsb2000Plus(UsbDevice):
         seconds = self.integration_us * 1e-6
         self._light.clock.sleep(seconds)
         at = wavelength_nm()
-        seen = self._light.radiance()
+        radiance = self._light.radiance()
         fine = np.arange(at[0] - 10.0, at[-1] + 10.0, 0.25)
-        blurred = gaussian_filter1d(seen.at(fine), SLIT_FWHM_NM / 2.3548 / 0.25)
+        blurred = gaussian_filter1d(radiance.at(fine), SLIT_FWHM_NM / 2.3548 / 0.25)
         true = np.interp(at, fine, blurred) * response(at) * seconds
         true[: DARK_PIXELS.stop] = 0.0  # covered by metal
         measured = true

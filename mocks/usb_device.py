@@ -125,17 +125,17 @@ class UsbDevice:
 
     def device_descriptor(self) -> bytes:
         """Return the 18 bytes of the device descriptor."""
-        one = self.identity
+        identity = self.identity
         return struct.pack(
             "<BBHBBBBHHHBBBB",
             18,
             1,
-            one.usb_version,
-            *one.device_class,
-            one.max_packet_0,
-            one.vendor_id,
-            one.product_id,
-            one.release,
+            identity.usb_version,
+            *identity.device_class,
+            identity.max_packet_0,
+            identity.vendor_id,
+            identity.product_id,
+            identity.release,
             1,
             2,
             3,

@@ -114,8 +114,6 @@ class Grammar(ABC):
         return code
 
 
-# --- faults ---------------------------------------------------------------------------------------------------------
-
 KINDS = ("late", "never", "half", "wrong", "error", "drop", "unplug")
 #: What only a camera's frames do: one comes torn, one comes twice, a trigger isn't heard. `never` is a frame that is
 #: dropped.
@@ -263,9 +261,6 @@ def _without_a_line(data: bytes, end: bytes) -> bytes:
     lines = data.split(end)
     del lines[(len(lines) - 1) // 2]
     return end.join(lines)
-
-
-# --- lines ----------------------------------------------------------------------------------------------------------
 
 
 class AddressError(Exception):

@@ -39,8 +39,8 @@ def choose_cache() -> None:
 
 
 def _can_make(folder: Path) -> bool:
-    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
-    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+    existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
+    return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
 
 
 def _is_own(folder: Path) -> bool:

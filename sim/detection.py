@@ -65,14 +65,14 @@ def detect_light(
     curves = (curve for light in lights for curve in light if curve is not None)
     wavelength_nm, width = _rule(efficiency(camera, channel), *curves)
     before_lens = light_of(camera, effects)
-    seen: dict[int, FloatArray] = {}
+    spectra: dict[int, FloatArray] = {}
     rows = []
     for radiance, reflectance in lights:
-        if id(radiance) not in seen:
+        if id(radiance) not in spectra:
             light = _at_lens(before_lens, radiance, wavelength_nm, kind)
             _check_radiance(wavelength_nm, light)
-            seen[id(radiance)] = light
-        light = seen[id(radiance)]
+            spectra[id(radiance)] = light
+        light = spectra[id(radiance)]
         rows.append(light if reflectance is None else light * reflectance.at(wavelength_nm))
     angles = np.asarray(sin_theta, float)[..., None, None]
     factor = responsivity(camera, channel, wavelength_nm, effects, angles) * width
@@ -89,9 +89,9 @@ def _at_lens(light: Light, radiance: Spectrum | None, wavelength_nm: FloatArray,
     if len(stated) < 2:  # nothing lies between its ends
         return np.zeros_like(wavelength_nm)
     inside = (wavelength_nm >= stated[0]) & (wavelength_nm <= stated[-1])
-    found = np.zeros_like(wavelength_nm)
-    found[inside] = light.radiance(wavelength_nm[inside], radiance.at(wavelength_nm[inside]), kind)
-    return found
+    radiance_at_lens = np.zeros_like(wavelength_nm)
+    radiance_at_lens[inside] = light.radiance(wavelength_nm[inside], radiance.at(wavelength_nm[inside]), kind)
+    return radiance_at_lens
 
 
 @lru_cache(maxsize=256)

@@ -16,7 +16,7 @@ from sim.effects.base import STAGES, Effect
 from sim.effects.library import may_change
 from sim.frame import (
     Exposure,
-    expected_sequence,
+    expect_sequence,
     pair_gain_factor,
     predict_frame,
     read_out,
@@ -72,18 +72,19 @@ def everything(acting: tuple[Effect, ...]) -> NDArray[Any]:
     ]
     frame = predict_frame(CAMERA, Exposure(UniformField(LIGHT), 0.01), acting)
     place = np.linspace(-40.0, 40.0, 5)
-    one = Uniform(CAMERA, acting)
+    even = Uniform(CAMERA, acting)
     moved = displaced_um(CAMERA, place, 0.5 * place, 620.0, acting)
-    rest = [one.source(600.0), one.collected_s(0.02), one.ambient_e("G", 1.0) / 1e3, one.offset_dn(600.0, 30.0, 0.02),
-            float(one.shot_e2(np.array(9e3))), even_share(CAMERA, acting), sum(h[0] for h in halos(CAMERA, acting)),
-            1e3 * one.unsteadiness**2, *(light_of(CAMERA, acting).colour(c, 600.0) for c in "RGB"),
+    rest = [even.source(600.0), even.collected_s(0.02), even.ambient_e("G", 1.0) / 1e3,
+            even.offset_dn(600.0, 30.0, 0.02), float(even.shot_e2(np.array(9e3))),
+            even_share(CAMERA, acting), sum(h[0] for h in halos(CAMERA, acting)),
+            1e3 * even.unsteadiness**2, *(light_of(CAMERA, acting).colour(c, 600.0) for c in "RGB"),
             signal_of(CAMERA, acting).changing_e2(600.0),
             *signal_of(CAMERA, acting).read_power(np.array([0.0, 0.2, 0.4])),
-            *one.shade_light(np.ones(5), place, place),
+            *even.shade_light(np.ones(5), place, place),
             *np.ravel(np.zeros(10) if moved is None else moved)]  # fmt: skip
     # what acts on dark pixels, on the frame after, and on the read-out, in electrons or DN
     dark = Exposure(Darkness(), 0.5, temperature_c=32.0)
-    after = list(expected_sequence(CAMERA, [Exposure(UniformField(LIGHT), 0.004), dark], acting))
+    after = list(expect_sequence(CAMERA, [Exposure(UniformField(LIGHT), 0.004), dark], acting))
     out = read_out(CAMERA, dark, acting)
     levels = np.linspace(0.0, 4000.0, 41)
     electronics = [np.broadcast_to(more, frame.shape).ravel() for more in (*after, out.added_e, out.added_e2)]
@@ -118,10 +119,10 @@ SMALL, CURVED = 0.05, 0.1
 
 def complaints(kind: type[Effect]) -> tuple[str, ...]:
     """Return what an effect doesn't keep of the contract, a line each."""
-    return (*absent_complaints(kind), *declared_complaints(kind), *slope_complaints(kind), *prototype_complaints(kind))
+    return (*check_absence(kind), *check_declarations(kind), *slope_complaints(kind), *prototype_complaints(kind))
 
 
-def absent_complaints(kind: type[Effect]) -> Iterator[str]:
+def check_absence(kind: type[Effect]) -> Iterator[str]:
     """Yield what is wrong with the effect without arguments: it has to be absent, the baseline exactly."""
     absent = kind()
     for name, quantity in kind.quantities().items():
@@ -131,7 +132,7 @@ def absent_complaints(kind: type[Effect]) -> Iterator[str]:
         yield "absent, it changes a prediction: give the states back as they came"
 
 
-def declared_complaints(kind: type[Effect]) -> Iterator[str]:
+def check_declarations(kind: type[Effect]) -> Iterator[str]:
     """Yield what is missing of what a diagnosis reads."""
     stages = kind.stages()
     if not stages or not set(stages) <= set(STAGES):
@@ -174,6 +175,6 @@ def prototype_complaints(kind: type[Effect]) -> Iterator[str]:
     for number, places in enumerate(kind.prototypes(CAMERA), 1):
         if not places:
             yield f"prototypes: group {number} is empty"
-        for one in places:
-            if not np.abs(everything((one,)) - base).max() > 0:
-                yield f"prototypes: {one!r} changes nothing"
+        for prototype in places:
+            if not np.abs(everything((prototype,)) - base).max() > 0:
+                yield f"prototypes: {prototype!r} changes nothing"

@@ -1,5 +1,5 @@
 """What other packages add, by entry points: `calibench.effects`, `calibench.observables`, `calibench.importers`,
-`calibench.capture_kinds`, `calibench.illuminants`. Drivers have a registry of their own.
+`calibench.capture_kinds`, `calibench.illuminants`, `calibench.commands`. Drivers have a registry of their own.
 
 An extension that can't be loaded, or isn't what its group asks for, is one line in the log and stops nothing.
 """
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
-Group = Literal["effects", "observables", "importers", "capture_kinds", "illuminants"]
+Group = Literal["effects", "observables", "importers", "capture_kinds", "illuminants", "commands"]
 log = logging.getLogger(__name__)
 _refused: dict[tuple[str, str], str] = {}
 
@@ -25,11 +25,11 @@ def extensions(group: Group) -> Iterator[tuple[str, Any]]:
     """Yield name and object of every extension of a group that can be loaded; the others are refused."""
     for point in installed(group):
         try:
-            found = point.load()
+            extension = point.load()
         except Exception as error:  # whatever another's module does when it is imported
             refuse(group, point.name, f"{point.value} can't be loaded ({type(error).__name__}: {error})")
         else:
-            yield point.name, found
+            yield point.name, extension
 
 
 def refuse(group: Group, name: str, why: str) -> None:

@@ -78,7 +78,7 @@ def expected_electrons(
     light = scene_light(
         camera, exposure.scene, effects, oversample=oversample, margin_px=margin_px, placed=exposure.placed
     )
-    return collected_electrons(light, camera, exposure, effects, source=source)
+    return collect_electrons(light, camera, exposure, effects, source=source)
 
 
 def unsteady_source(camera: CameraModel, effects: Sequence[Effect], elapsed_s: float) -> float:
@@ -131,7 +131,7 @@ def scene_light(
     return SceneLight(mosaic.assemble(images, camera.cfa), mosaic.assemble(room, camera.cfa))
 
 
-def collected_electrons(
+def collect_electrons(
     light: SceneLight, camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, source: float = 1.0
 ) -> FloatArray:
     """`expected_electrons` of a scene whose light is known. `source`: factor on the scene's light at this time, beside
@@ -235,12 +235,11 @@ def with_reflections(camera: CameraModel, image: FloatArray, effects: Sequence[E
 def collected_mosaic(
     camera: CameraModel, electrons: FloatArray, effects: Sequence[Effect], *, exposure_s: float, elapsed_s: float
 ) -> FloatArray:
-    """Mean electrons (rows, cols) of light, in frames of any size, as pixels collect and share them; what packets leave
-    behind on their way to the output is that of the camera's middle."""
+    """Mean electrons (rows, cols) of light, in frames of any size, as pixels collect and share them, before they are
+    clocked out."""
     rows = light_of(camera, effects).row_factors(len(electrons), exposure_s, elapsed_s)
     charge = charge_of(camera, effects)
-    moved = charge.move_charge(charge.collect_light(electrons if rows is None else electrons * rows[:, None]))
-    return charge.trail_tile(moved)
+    return charge.move_charge(charge.collect_light(electrons if rows is None else electrons * rows[:, None]))
 
 
 def pair_gain_factor(camera: CameraModel, effects: Sequence[Effect]) -> float:
@@ -260,10 +259,10 @@ def check_overlap(camera: CameraModel, scene: Scene) -> None:
     mistaken.
     """
     shining = [light for light in _lights_of(scene) if max(light.value) > 0]
-    seen = [_span_nm([efficiency(camera, channel)]) for channel in camera.channels]
+    sensitive = [_span_nm([efficiency(camera, channel)]) for channel in camera.channels]
     lit = _span_nm(shining)
-    if shining and all(min(high, lit[1]) <= max(low, lit[0]) for low, high in seen):
-        low, high = min(span[0] for span in seen), max(span[1] for span in seen)
+    if shining and all(min(high, lit[1]) <= max(low, lit[0]) for low, high in sensitive):
+        low, high = min(span[0] for span in sensitive), max(span[1] for span in sensitive)
         raise ValueError(
             f"the scene's light lies at {lit[0]:g} to {lit[1]:g} nm, outside the limits {low:g} to {high:g} nm of the "
             "quantum efficiency: give wavelengths in nm, or a curve that reaches the light"
@@ -376,7 +375,7 @@ def sample(
     )
 
 
-def expected_sequence(
+def expect_sequence(
     camera: CameraModel,
     exposures: Iterable[Exposure],
     effects: Sequence[Effect] = (),
@@ -418,10 +417,10 @@ def sample_sequence(
     margin_px: int = 32,
 ) -> Iterator[NDArray[np.uint16]]:
     """Raw frames (rows, cols) of exposures taken one after the other, drawn as `sample` does from
-    `expected_sequence`.
+    `expect_sequence`.
     """
     every = list(exposures)
-    means = expected_sequence(camera, every, effects, oversample=oversample, margin_px=margin_px, drawn=True)
+    means = expect_sequence(camera, every, effects, oversample=oversample, margin_px=margin_px, drawn=True)
     for exposure, electrons in zip(every, means, strict=True):
         yield sensor.sample_from(
             electrons,
@@ -443,7 +442,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
     disturbances = (*signal.random_at(exposure.elapsed_s), *particles)
 
     def draw_disturbances(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
-        return sum((one.draw(shape, rng) for one in disturbances), np.zeros((1, 1)))
+        return sum((disturbance.draw(shape, rng) for disturbance in disturbances), np.zeros((1, 1)))
 
     # Only where there is a law something acts, so that effects elsewhere leave the read-out the baseline's to the last
     # bit.
@@ -453,8 +452,8 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         charge.shot_e2 if charge.variance_e2 else None,
         signal.shift_dn(exposure.elapsed_s, exposure.temperature_c, exposure.exposure_s),
         draw_disturbances if disturbances else None,
-        sum((one.mean_e(shape) for one in disturbances), 0.0),
-        sum((one.variance_e2(shape) for one in disturbances), 0.0),
+        sum((disturbance.mean_e(shape) for disturbance in disturbances), 0.0),
+        sum((disturbance.variance_e2(shape) for disturbance in disturbances), 0.0),
         codes.convert if codes.codes else None,
         charge.neighbour_correlation if charge.correlation else None,
         signal.filter_kernel(),

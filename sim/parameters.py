@@ -55,8 +55,8 @@ class Quantity:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
         def check(value: Any) -> Any:
-            for one in value if isinstance(value, tuple) else (value,):
-                check_one(one)
+            for number in value if isinstance(value, tuple) else (value,):
+                check_one(number)
             return value
 
         unit = "" if self.unit == "1" else f" {self.unit}"
@@ -89,9 +89,9 @@ class Quantity:
 
 def read_quantities(model: type[BaseModel]) -> dict[str, Quantity]:
     """Field name -> its `Quantity`, for every field of `model` that declares one, in the order of declaration."""
-    found: dict[str, Quantity] = {}
+    quantities: dict[str, Quantity] = {}
     for name, field in model.model_fields.items():
         for item in field.metadata:
             if isinstance(item, Quantity):
-                found[name] = item
-    return found
+                quantities[name] = item
+    return quantities

@@ -75,12 +75,12 @@ def plain_images(
     elif isinstance(scene, KnifeEdge):
         images = {c: _edge_image(camera, c, scene, effects) for c in camera.channels}
     elif isinstance(scene, PosedEdges):
-        images = _posed_edge_images(camera, scene, effects)
+        images = _draw_posed_edges(camera, scene, effects)
     elif isinstance(scene, SpectralImage):
         images = _cube_images(camera, scene, effects, oversample, _margin_for(camera, effects, margin_px))
     else:
         grid = Grid(*shape, oversample, _margin_for(camera, effects, margin_px))
-        images = _blurred_images(camera, scene, effects, grid, transfers)
+        images = _blur_images(camera, scene, effects, grid, transfers)
     return images
 
 
@@ -134,7 +134,7 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
     moves = image_of(camera, effects).moves
     if moves:
         mean_nm = _mean_wavelength(camera, channel, scene.light_radiance, effects, scene.kind)
-        from_px = _unmoved_px(camera, row, col, mean_nm, effects)
+        from_px = _undo_shift_px(camera, row, col, mean_nm, effects)
     for index, edge in enumerate(scene.regions):
         mine = owner == index
         if not np.any(mine):
@@ -148,7 +148,7 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
         if moves:
             # by place as the channel's mean wavelength is moved; what others differ from that, alike over a region,
             # blurs
-            distance, angle_deg = _bent_edge(edge.distance_px(*from_px), middle)
+            distance, angle_deg = _bend_edge(edge.distance_px(*from_px), middle)
             distance = distance[mine]
         else:
             distance, angle_deg = edge.distance_px(row[mine], col[mine]), edge.angle_deg
@@ -172,7 +172,7 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
     return image
 
 
-def _posed_edge_images(camera: CameraModel, scene: PosedEdges, effects: Sequence[Effect]) -> dict[str, FloatArray]:
+def _draw_posed_edges(camera: CameraModel, scene: PosedEdges, effects: Sequence[Effect]) -> dict[str, FloatArray]:
     """Electrons a second of every channel, before cos^4: a pixel sees the profile of its edge at its own distance, and
     lens and perspective bend distance and slope along the edge. The transfer is that of the place where the edge's
     middle is seen.
@@ -191,7 +191,7 @@ def _posed_edge_images(camera: CameraModel, scene: PosedEdges, effects: Sequence
         place = None
         if moves:
             mean_nm = _mean_wavelength(camera, channel, scene.light_radiance, effects, scene.kind)
-            place = np.stack(_unmoved_px(camera, pixels[0], pixels[1], mean_nm, effects)) + margin
+            place = np.stack(_undo_shift_px(camera, pixels[0], pixels[1], mean_nm, effects)) + margin
         mine = owner[inner] if place is None else map_coordinates(owner, place, order=0, mode="nearest")
         rates = [electron_rate(camera, channel, radiance, effects, scene.kind) for radiance in spectra]
         field = _field_of_rates(camera, channel, [(radiance, None) for radiance in spectra], effects, scene.kind)
@@ -206,16 +206,16 @@ def _posed_edge_images(camera: CameraModel, scene: PosedEdges, effects: Sequence
             if place is None:
                 near = tuple(np.rint(at).astype(int) + margin)
                 angle_deg = float(np.rad2deg(np.arctan2(down[near], across[near])))
-                seen = (distance / np.hypot(down, across))[inner][use]
+                across_px = (distance / np.hypot(down, across))[inner][use]
             else:
                 at = at + np.ravel(_shift_px(camera, at[:1], at[1:], mean_nm, effects))
                 there = np.asarray(map_coordinates(distance, place, order=3, mode="nearest"))
-                bent, angle_deg = _bent_edge(there, (float(at[0]), float(at[1])))
-                seen = bent[use]
+                bent, angle_deg = _bend_edge(there, (float(at[0]), float(at[1])))
+                across_px = bent[use]
             from_centre_um = (at - 0.5 * (np.array([camera.rows, camera.cols]) - 1.0)) * camera.pixel_pitch_um
             profile = partial(
-                edge_profile, camera, channel, angle_deg=angle_deg, distance_px=seen, kind=scene.kind, collected=True,
-                place_um=(float(from_centre_um[1]), float(from_centre_um[0])),
+                edge_profile, camera, channel, angle_deg=angle_deg, distance_px=across_px, kind=scene.kind,
+                collected=True, place_um=(float(from_centre_um[1]), float(from_centre_um[0])),
             )  # fmt: skip
             profiles = [profile(radiance=scene.light_radiance, effects=effects)]
             if not _have_same_colour(*spectra):
@@ -228,7 +228,7 @@ def _posed_edge_images(camera: CameraModel, scene: PosedEdges, effects: Sequence
     return images
 
 
-def _bent_edge(distance: FloatArray, at_px: tuple[float, float]) -> tuple[FloatArray, float]:
+def _bend_edge(distance: FloatArray, at_px: tuple[float, float]) -> tuple[FloatArray, float]:
     """Compute distances from an edge that the lens bends, to first order.
 
     distance : distance (px) from the straight edge of the place where each pixel's light comes from (rows, cols)
@@ -241,15 +241,15 @@ def _bent_edge(distance: FloatArray, at_px: tuple[float, float]) -> tuple[FloatA
     return distance / np.hypot(down, across), float(np.rad2deg(np.arctan2(down[near], across[near])))
 
 
-def _have_same_colour(one: Spectrum, other: Spectrum) -> bool:
+def _have_same_colour(first: Spectrum, other: Spectrum) -> bool:
     """Return whether two lights have the same colour."""
-    (w, a), (x, b) = one.arrays, other.arrays
+    (w, a), (x, b) = first.arrays, other.arrays
     return (
         w.shape == x.shape and bool(np.all(w == x)) and np.allclose(a * np.sum(b), b * np.sum(a), rtol=1e-9, atol=0.0)
     )
 
 
-def _blurred_images(
+def _blur_images(
     camera: CameraModel, scene: Scene, effects: Sequence[Effect], grid: Grid, kept: KeptTransfers | None = None
 ) -> dict[str, FloatArray]:
     """Electrons a second (rows, cols) of every channel, of a scene drawn by area and convolved, before cos^4.
@@ -353,7 +353,7 @@ def _cube_images(
 ) -> dict[str, FloatArray]:
     """Electrons a second (rows, cols) of every channel, of a cube of spectra, before cos^4.
 
-    As in `_blurred_images`, image = sum_k OTF_k F[sum_b w_bk band_b]: a cube of any number of bands becomes one picture
+    As in `_blur_images`, image = sum_k OTF_k F[sum_b w_bk band_b]: a cube of any number of bands becomes one picture
     a wavelength of the rule. A cube whose samples are the camera's pixels needs no finer grid: its transfer is folded.
     """
     moves = image_of(camera, effects).moves
@@ -372,10 +372,10 @@ def _cube_images(
         spectrum = np.zeros((ny, nx // 2 + 1), np.complex64)
         for node, picture in zip(nodes, pictures, strict=True):
             if aligned:
-                transfer = _folded_transfer(blur, float(node), (ny, nx))
+                transfer = _fold_transfer(blur, float(node), (ny, nx))
                 fine = np.zeros((ny, nx), np.float32)
-                seen = picture[: camera.rows + margin_px, : camera.cols + margin_px]
-                fine[: seen.shape[0], : seen.shape[1]] = seen
+                covered = picture[: camera.rows + margin_px, : camera.cols + margin_px]
+                fine[: covered.shape[0], : covered.shape[1]] = covered
             else:
                 transfer = blur.at(float(node), fx, fy)
                 drawn = cell_means(picture.astype(float), scene.warp(), grid, 0.0)
@@ -415,7 +415,7 @@ def _node_pictures(
     return nodes, out
 
 
-def _folded_transfer(blur: Blur, wavelength_nm: float, shape: tuple[int, int]) -> FloatArray | ComplexArray:
+def _fold_transfer(blur: Blur, wavelength_nm: float, shape: tuple[int, int]) -> FloatArray | ComplexArray:
     """Return the transfer of lens and effects with the pixel's aperture and a picture's square of one pixel, folded
     onto samples of one pixel.
     """
@@ -461,7 +461,7 @@ def _shift_px(
     px."""
     pitch = camera.pixel_pitch_um
     x_um, y_um = (col - 0.5 * (camera.cols - 1)) * pitch, (row - 0.5 * (camera.rows - 1)) * pitch
-    right, down = image_of(camera, effects).shifted_um(x_um, y_um, wavelength_nm)
+    right, down = image_of(camera, effects).shift_um(x_um, y_um, wavelength_nm)
     shape = np.broadcast_shapes(row.shape, col.shape)
     return np.broadcast_to(np.asarray(down) / pitch, shape), np.broadcast_to(np.asarray(right) / pitch, shape)
 
@@ -475,7 +475,7 @@ def _mean_wavelength(
     return float(nodes @ share)
 
 
-def _unmoved_px(
+def _undo_shift_px(
     camera: CameraModel, row: FloatArray, col: FloatArray, wavelength_nm: float, effects: Sequence[Effect]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the places p with p + shift(p) = (row, col), by fixed-point steps to 1e-4 px: shifts change by less than
@@ -505,7 +505,7 @@ def _margin_for(camera: CameraModel, effects: Sequence[Effect], margin_px: int) 
     rim_col = np.concatenate([np.zeros(33), np.full(33, camera.cols - 1.0), col, col])
     out = 0.0
     for wavelength_nm in (400.0, 550.0, 700.0):
-        from_row, from_col = _unmoved_px(camera, rim_row, rim_col, wavelength_nm, effects)
+        from_row, from_col = _undo_shift_px(camera, rim_row, rim_col, wavelength_nm, effects)
         out = max(out, *(float(np.max(np.abs(a - b))) for a, b in ((from_row, rim_row), (from_col, rim_col))))
     return margin_px + int(np.ceil(out))
 
@@ -536,7 +536,7 @@ class _Moved:
 
     def _from_px(self, wavelength_nm: float) -> tuple[FloatArray, FloatArray]:
         row, col = np.meshgrid(self._rows, self._cols, indexing="ij")
-        return _unmoved_px(self._camera, row, col, wavelength_nm, self._effects)
+        return _undo_shift_px(self._camera, row, col, wavelength_nm, self._effects)
 
 
 def _relative_to_ground(

@@ -93,8 +93,8 @@ class Blur:
     ) -> FloatArray | ComplexArray:
         """Return the same over the transfer of the lens without effects."""
         fx, fy = fx_cy_per_px / self.camera.pixel_pitch_um, fy_cy_per_px / self.camera.pixel_pitch_um
-        beside = self.image.otf_beside_lens(fx, fy, wavelength_nm, place_um)
-        return times(beside, self._in_pixels(wavelength_nm, fx_cy_per_px, fy_cy_per_px, place_um))
+        effects_otf = self.image.otf_beside_lens(fx, fy, wavelength_nm, place_um)
+        return times(effects_otf, self._in_pixels(wavelength_nm, fx_cy_per_px, fy_cy_per_px, place_um))
 
     @property
     def is_lens_alone(self) -> bool:
@@ -142,7 +142,7 @@ def displaced_um(
     image = image_of(camera, effects)
     if not image.moves:
         return None
-    right, down = image.shifted_um(x_um, y_um, wavelength_nm)
+    right, down = image.shift_um(x_um, y_um, wavelength_nm)
     return np.asarray(right), np.asarray(down)
 
 
@@ -168,7 +168,7 @@ def dispersal(
     x, y = (np.array(part, float) for part in zip(*places_um, strict=True))
 
     def shift_px(at_nm: float) -> FloatArray:
-        pair = (np.broadcast_to(np.asarray(part, float), x.shape) for part in image.shifted_um(x, y, at_nm))
+        pair = (np.broadcast_to(np.asarray(part, float), x.shape) for part in image.shift_um(x, y, at_nm))
         return np.array(list(pair)) / camera.pixel_pitch_um
 
     single = np.array([shift_px(float(w)) for w in wavelength_nm])
@@ -264,15 +264,15 @@ def _turned(steps: NDArray[np.integer[Any]], f: FloatArray) -> ComplexArray:
 def trail_behind(camera: CameraModel, effects: Sequence[Acts], axis: Literal[0, 1], line: float, lag_px: int) -> float:
     """Return by how much the pixel `lag_px` lines behind one that alone has charge exceeds that before it, over that
     one's signal; `axis` 0 along a column, 1 along a row, `line` its place there."""
-    found = 0.0
+    asymmetry = 0.0
     charge = charge_of(camera, effects)
     lines = (camera.rows, camera.cols)[axis]
     for law in charge.trails:
         if law.axis == axis:
             kernel = np.ravel(law.kernel(float(law.transfers(np.asarray(line), lines))))
             middle = len(kernel) // 2
-            found += float((kernel[middle + lag_px] - kernel[middle - lag_px]) / kernel[middle])
-    return found
+            asymmetry += float((kernel[middle + lag_px] - kernel[middle - lag_px]) / kernel[middle])
+    return asymmetry
 
 
 def even_share(camera: CameraModel, effects: Sequence[Acts]) -> float:
@@ -359,23 +359,23 @@ def common_wavelengths(
     and narrow lights come out as by a sight's own nodes (2e-8 at 10 nodes; near a lens's cutoff, which is no polynomial
     in the wavelength, 5e-4).
     """
-    found = _seen_light(camera, sights, effects, kind)
+    spectra = _weigh_light(camera, sights, effects, kind)
     # what lets wavelengths land apart turns fast with the wavelength: at nodes of another light, ten are too few
     if effects and not image_of(camera, effects).moves:
-        nodes = _pooled_nodes(_seen_light(camera, sights, (), kind), count)
-        shares = np.concatenate([lagrange_shares(at, part[None], nodes) for at, part in found])
+        nodes = _pool_nodes(_weigh_light(camera, sights, (), kind), count)
+        shares = np.concatenate([lagrange_shares(at, part[None], nodes) for at, part in spectra])
         if np.abs(shares).sum(axis=1).max() < MOST_SHARES:
             return nodes, shares
-    nodes = _pooled_nodes(found, count)
-    return nodes, np.concatenate([lagrange_shares(at, part[None], nodes) for at, part in found])
+    nodes = _pool_nodes(spectra, count)
+    return nodes, np.concatenate([lagrange_shares(at, part[None], nodes) for at, part in spectra])
 
 
-def _pooled_nodes(seen: Sequence[tuple[FloatArray, FloatArray]], count: int) -> FloatArray:
+def _pool_nodes(spectra: Sequence[tuple[FloatArray, FloatArray]], count: int) -> FloatArray:
     """Gauss's nodes for the mean weight of several sights; these have most of their wavelengths in common: each
     once.
     """
-    position, which = np.unique(np.concatenate([at for at, _ in seen]), return_inverse=True)
-    pooled = np.bincount(which, np.concatenate([part for _, part in seen])) / len(seen)
+    position, which = np.unique(np.concatenate([at for at, _ in spectra]), return_inverse=True)
+    pooled = np.bincount(which, np.concatenate([part for _, part in spectra])) / len(spectra)
     return gauss_rule(position, pooled, count)[0]
 
 
@@ -388,22 +388,22 @@ def wavelength_shares(
 ) -> FloatArray:
     """Return how much each of `wavelength_nm` (ascending) counts for each of several sights (channel, light) in a mean
     over the light that it detects, (sights, wavelengths), of what is linear between them: sum 1 over a sight."""
-    seen = _seen_light(camera, sights, effects, kind)
-    return np.array([linear_shares(at, part, wavelength_nm) for at, part in seen])
+    spectra = _weigh_light(camera, sights, effects, kind)
+    return np.array([linear_shares(at, part, wavelength_nm) for at, part in spectra])
 
 
-def _seen_light(
+def _weigh_light(
     camera: CameraModel, sights: Sequence[tuple[str, Spectrum | None]], effects: Sequence[Acts], kind: str
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Compute the spectrum that each sight detects.
 
     Returns for each sight wavelengths (nm) and their weights, of sum 1. A sight without light has that of equal energy.
     """
-    found = []
+    spectra = []
     for channel, radiance in sights:
         wavelength_nm, weight = detect_light(camera, channel, [(radiance, None)], effects, kind)
-        found.append(otf_weight(camera, channel, wavelength_nm, weight[0]))
-    return found
+        spectra.append(otf_weight(camera, channel, wavelength_nm, weight[0]))
+    return spectra
 
 
 def transfer_at(

@@ -112,17 +112,41 @@ class Spectrum(Frozen):
 
 
 def photons_from_energy(wavelength_nm: ArrayLike, energy: ArrayLike) -> FloatArray:
-    """Photons per (s nm ...) of a quantity in W per (nm ...): value x w / (h c)."""
+    """Convert energy to photons: value x w / (h c).
+
+    wavelength_nm, energy : arrays that broadcast, nm and W per (nm ...)
+
+    Returns photons per (s nm ...).
+
+    >>> f"{photons_from_energy(500.0, 1.0):.4g}"
+    '2.517e+18'
+    """
     return np.asarray(energy, float) * np.asarray(wavelength_nm, float) / PHOTON_ENERGY_J_NM
 
 
 def energy_from_photons(wavelength_nm: ArrayLike, photons: ArrayLike) -> FloatArray:
-    """W per (nm ...) of a quantity in photons per (s nm ...): value x h c / w, the inverse of `photons_from_energy`."""
+    """Convert photons to energy: value x h c / w, the inverse of `photons_from_energy`.
+
+    wavelength_nm, photons : arrays that broadcast, nm and photons per (s nm ...)
+
+    Returns W per (nm ...).
+
+    >>> float(energy_from_photons(500.0, photons_from_energy(500.0, 3.0)))
+    3.0
+    """
     return np.asarray(photons, float) * PHOTON_ENERGY_J_NM / np.asarray(wavelength_nm, float)
 
 
 def blackbody_radiance(temperature_k: float, wavelength_nm: ArrayLike) -> Spectrum:
-    """Planck's law: radiance W sr^-1 m^-2 nm^-1 of a black body, 2 h c^2 / w^5 / (exp(h c / (w k T)) - 1)."""
+    """Compute Planck's law, 2 h c^2 / w^5 / (exp(h c / (w k T)) - 1).
+
+    temperature_k : K; wavelength_nm : ascending, nm
+
+    Returns the radiance, W sr^-1 m^-2 nm^-1. Raises ValueError for a temperature that isn't above 0.
+
+    >>> f"{blackbody_radiance(5800.0, [500.0, 600.0]).at(500.0):.3g}"
+    '2.69e+04'
+    """
     if not temperature_k > 0:
         raise ValueError(f"temperature {temperature_k} K is not above the limit of 0 K: give the kelvins of a source")
     w = np.asarray(wavelength_nm, float) * 1e-9
@@ -131,10 +155,17 @@ def blackbody_radiance(temperature_k: float, wavelength_nm: ArrayLike) -> Spectr
 
 
 def quadrature(spectra: Iterable[Spectrum], step_nm: float = 5.0) -> tuple[FloatArray, FloatArray]:
-    """Wavelengths (nm) and weights (nm) that integrate a product of the given curves: sum weight x product.
+    """Choose a quadrature for a product of the given curves: Simpson's rule between all their knots.
 
-    Simpson's rule between all knots of all curves, no wider than `step_nm`: exact for a product of two piecewise linear
-    curves and the wavelength, however narrow a line is; good to 1e-6 for smooth factors beside them.
+    spectra : the factors; step_nm : the widest interval, nm
+
+    Returns wavelengths (nm) and weights (nm), of which sum weight x product is the integral: exact for a product of
+    two piecewise linear curves and the wavelength, however narrow a line is; good to 1e-6 for smooth factors
+    besides.
+
+    >>> w, weight = quadrature([Spectrum.of([400.0, 500.0], [0.0, 1.0])])
+    >>> round(float(weight @ ((w - 400.0) / 100.0) ** 2), 9)  # integral of x^2, 100 nm / 3
+    33.333333333
     """
     knots = np.unique(np.concatenate([spectrum.arrays[0] for spectrum in spectra]))
     if knots.size < 2:
@@ -154,12 +185,17 @@ def quadrature(spectra: Iterable[Spectrum], step_nm: float = 5.0) -> tuple[Float
 
 
 def gauss_rule(position: FloatArray, weight: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Gauss's quadrature for a discrete weight: at most `count` nodes and shares with the same moments up to 2
-    count - 1.
+    """Compute Gauss's quadrature for a discrete weight (Golub and Welsch 1969).
 
-    Lanczos's tridiagonal matrix of the positions in the weight's inner product; nodes are its eigenvalues, shares the
-    squares of the eigenvectors' first entries (Golub and Welsch 1969). `position` ascends; weights are >= 0 and add up
-    to 1.
+    position : (n,), ascending; weight : (n,), >= 0, of sum 1; count : the most nodes
+
+    Returns nodes and shares, (count,) or fewer, with the same moments up to 2 count - 1: the eigenvalues of
+    Lanczos's tridiagonal matrix of the positions in the weight's inner product, and the squares of its eigenvectors'
+    first entries.
+
+    >>> nodes, shares = gauss_rule(np.array([0.0, 1.0, 2.0]), np.array([0.25, 0.5, 0.25]), 2)
+    >>> nodes.round(6).tolist(), shares.round(6).tolist()  # mean 1, variance 1/2
+    ([0.292893, 1.707107], [0.5, 0.5])
     """
     used = weight > 0
     x, w = position[used], weight[used]
@@ -187,8 +223,14 @@ def gauss_rule(position: FloatArray, weight: FloatArray, count: int) -> tuple[Fl
 
 
 def linear_shares(position: FloatArray, weight: FloatArray, nodes: FloatArray) -> FloatArray:
-    """(nodes,): how much each of the nodes, ascending, counts in sum weight x g, for g given at the nodes and linear
-    between them; positions beyond count for the outermost. The shares add up to the weights' sum.
+    """Compute how much each node counts in sum weight x g, for g that is linear between the nodes.
+
+    position, weight : (n,); nodes : (m,), ascending. Positions beyond the nodes count for the outermost
+
+    Returns (m,), of the weights' sum.
+
+    >>> linear_shares(np.array([1.0]), np.array([1.0]), np.array([0.0, 4.0])).tolist()
+    [0.75, 0.25]
     """
     left = np.clip(np.searchsorted(nodes, position) - 1, 0, len(nodes) - 2)
     on = np.clip((position - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0)
@@ -197,8 +239,14 @@ def linear_shares(position: FloatArray, weight: FloatArray, nodes: FloatArray) -
 
 
 def lagrange_shares(position: FloatArray, weight: FloatArray, nodes: FloatArray) -> FloatArray:
-    """(curves, nodes): how much each node counts in sum weight x g, for g given at the nodes only and taken as the
-    polynomial through them. `weight` is (curves, positions); the shares of a curve add up to its sum, exactly.
+    """Compute how much each node counts in sum weight x g, for the polynomial g through its values at the nodes.
+
+    position : (n,); weight : (curves, n); nodes : (m,)
+
+    Returns (curves, m); the shares of a curve add up to the sum of its weights, exactly.
+
+    >>> lagrange_shares(np.array([1.0]), np.array([[1.0]]), np.array([0.0, 1.0, 2.0])).tolist()
+    [[0.0, 1.0, 0.0]]
     """
     # the barycentric form: as exact as the products, at a cost of nodes x positions (Berrut and Trefethen 2004)
     apart = (nodes[:, None] - nodes) / max(float(np.ptp(nodes)), 1e-300)

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import reduce
-from typing import Any, Protocol, Self
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,8 @@ from sim.sensor.defects import Defects, Jumps
 from sim.sensor.electrons import NEIGHBOURS, NO_MULTIPLICATION, Multiplication
 from sim.sensor.lines import LineGains, LineNoise
 from sim.sensor.particles import Particles
-from sim.sensor.reading_order import OrderedNoise
-from sim.sensor.trails import Trails
+from sim.sensor.reading_order import ReadOutNoise
+from sim.sensor.trails import Trails, read_combs
 from sim.spectrum import FloatArray
 
 ComplexArray = NDArray[np.complex128]
@@ -270,7 +270,7 @@ class Image(State):
         """Return whether any law lets light land elsewhere."""
         return bool(self.shift)
 
-    def shifted_um(
+    def shift_um(
         self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float
     ) -> tuple[FloatArray | float, FloatArray | float]:
         """Return how far (dx, dy) light of one wavelength lands from where the baseline has it."""
@@ -300,8 +300,8 @@ class Image(State):
         if not self.patterns or total <= 0.0:
             return np.ones(np.broadcast_shapes(np.shape(x_um), np.shape(y_um)))
         each = [law.at(wavelength_nm, electrons / total, x_um, y_um) for law in self.patterns]
-        found = np.prod(each, axis=0)
-        return np.asarray(found / found.mean())
+        pattern = np.prod(each, axis=0)
+        return np.asarray(pattern / pattern.mean())
 
     def with_copies(self, image: FloatArray) -> FloatArray:
         """Return a channel's whole image (rows, cols) with its reflections."""
@@ -360,11 +360,11 @@ class Stray:
         row, col = (np.arange(float(n)) - 0.5 * (n - 1) for n in electrons.shape)
         x_um, y_um = (v * camera.pixel_pitch_um for v in np.meshgrid(col, row))
         by_channel = {c: self.shares(c, x_um, y_um) for c in camera.channels}
-        found = electrons
+        mixed = electrons
         for axis, kernel in enumerate((BESIDE, BESIDE.T)):
             stray = electrons * mosaic.assemble({c: both[axis] for c, both in by_channel.items()}, camera.cfa)
-            found = found - stray + convolve(stray, kernel, mode="mirror")
-        return np.asarray(found)
+            mixed = mixed - stray + convolve(stray, kernel, mode="mirror")
+        return np.asarray(mixed)
 
     def exchange_channels(
         self, electrons: Mapping[str, FloatArray], x_um: FloatArray, y_um: FloatArray
@@ -493,12 +493,12 @@ class Charge(State):
 
     def _transfers(self, place_um: tuple[float, float]) -> list[float]:
         """How often a packet of a place is transferred by each of `trails`."""
-        found = []
+        transfers = []
         for law in self.trails:
             lines, at_um = ((self.camera.rows, place_um[1]), (self.camera.cols, place_um[0]))[law.axis]
             line = np.clip(at_um / self.camera.pixel_pitch_um + 0.5 * (lines - 1), 0.0, lines - 1.0)
-            found.append(float(law.transfers(np.asarray(line), lines)))
-        return found
+            transfers.append(float(law.transfers(np.asarray(line), lines)))
+        return transfers
 
     def trail_otf(
         self, fx_cy_per_px: FloatArray, fy_cy_per_px: FloatArray, place_um: tuple[float, float]
@@ -513,24 +513,18 @@ class Charge(State):
         """Where the charge of a pixel at a place ends up by each of `trails`, (odd, odd)."""
         return [law.kernel(n) for law, n in zip(self.trails, self._transfers(place_um), strict=True)]
 
-    def trail_tile(self, electrons: FloatArray) -> FloatArray:
-        """Mean electrons (rows, cols) of a small part in the middle of even light, which goes on periodically, after
-        `trails` with as many transfers as in the frame's middle."""
-        tile = electrons
-        for law, transfers in zip(self.trails, self._transfers((0.0, 0.0)), strict=True):
-            frequency = np.asarray(np.fft.fftfreq(tile.shape[law.axis]), float)
-            along = law.otf(frequency, frequency, transfers)
-            shaped = along[:, None] if law.axis == 0 else along[None, :]
-            found = np.real(np.fft.ifft(np.fft.fft(tile, axis=law.axis) * shaped, axis=law.axis))
-            tile = law.steady_share(transfers) * found
-        return tile
+    def read_combs(self, axis: Literal[0, 1], step: int) -> FloatArray:
+        """Electrons (step, lines) that are read of the lines along an axis of the frame, given one electron in each
+        line of one phase of a mosaic of this period."""
+        lines = (self.camera.rows, self.camera.cols)[axis]
+        return read_combs(tuple(law for law in self.trails if law.axis == axis), lines, step)
 
     def multiplication(self, gain_db: float) -> Multiplication:
         """Random multiplication of each electron at a gain setting; of several in turn the factors multiply."""
         acting = [law(gain_db) for law in self.excess]
         if len(acting) <= 1:
             return acting[0] if acting else NO_MULTIPLICATION
-        return replace(acting[0], excess=math.prod(one.excess for one in acting))
+        return replace(acting[0], excess=math.prod(register.excess for register in acting))
 
     def hold_lag(self, electrons: FloatArray) -> FloatArray | float:
         """Return how many of a frame's electrons aren't read but stay for the next frame: image lag."""
@@ -594,9 +588,9 @@ class SharedNoise:
     def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         """Draw the noise of one frame, in electrons."""
         scale = np.sqrt(self.shared_e2)
-        own = np.moveaxis(rng.standard_normal(shape), self.axis, 0) * scale[:, None]
-        own[-1] = 0.0  # no line follows the last one
-        return np.moveaxis(own + np.roll(own, 1, axis=0), 0, self.axis)
+        shared = np.moveaxis(rng.standard_normal(shape), self.axis, 0) * scale[:, None]
+        shared[-1] = 0.0  # no line follows the last one
+        return np.moveaxis(shared + np.roll(shared, 1, axis=0), 0, self.axis)
 
     def mean_e(self, shape: tuple[int, ...]) -> float:
         """None."""
@@ -604,8 +598,8 @@ class SharedNoise:
 
     def variance_e2(self, shape: tuple[int, ...]) -> FloatArray:
         """Return what both neighbours share with each line."""
-        own = np.append(self.shared_e2[:-1], 0.0)
-        line = own + np.roll(own, 1)
+        shared_e2 = np.append(self.shared_e2[:-1], 0.0)
+        line = shared_e2 + np.roll(shared_e2, 1)
         return np.broadcast_to(line[:, None] if self.axis == 0 else line[None, :], shape)
 
 
@@ -637,7 +631,7 @@ class Signal(State):
     exposure_offset_dn: tuple[Callable[[float], float], ...] = ()
     noise_e2: tuple[Callable[[float], float], ...] = ()
     lines: tuple[LineNoise, ...] = ()
-    reading_order: tuple[OrderedNoise, ...] = ()
+    reading_order: tuple[ReadOutNoise, ...] = ()
     telegraph: tuple[Jumps, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
     filters: tuple[FloatArray, ...] = ()
@@ -748,8 +742,14 @@ class Codes(State):
 
 
 def kernel_otf(kernel: FloatArray, fx_cy_per_px: FloatArray, fy_cy_per_px: FloatArray) -> FloatArray | ComplexArray:
-    """Transfer function sum_ij k_ij exp(-2 pi i (fx (j - c) + fy (i - c))) of a kernel (odd, odd); real where the
-    kernel is symmetric.
+    """Compute the transfer function sum_ij k_ij exp(-2 pi i (fx (j - c) + fy (i - c))) of a kernel.
+
+    kernel : (odd, odd); fx_cy_per_px, fy_cy_per_px : arrays that broadcast, cycles per px
+
+    Returns the transfer function, real where the kernel is symmetric.
+
+    >>> kernel_otf(np.array([[0.25, 0.5, 0.25]]), np.array([0.0, 0.5]), np.zeros(2)).tolist()  # cos^2(pi f)
+    [1.0, 0.0]
     """
     half = kernel.shape[0] // 2, kernel.shape[1] // 2
     even = np.array_equal(kernel, kernel[::-1, ::-1])

@@ -77,12 +77,12 @@ def traced_image(
             kernels = Kernels(table, weight[members], frame, oversample, distorted=distorted)
             # The first picture, with most of the light, says how large tiles may be.
             tiles = kernels.tiles(target) if tiles is None else tiles
-            seen = imaged
+            blurred = imaged
             if spectrum is not None:
                 light = np.sum(weight[members[0]], axis=0)
                 transfer = _effects_transfer(blur, table, light, target)
-                seen = np.asarray(fft.irfft2(spectrum * transfer, imaged.shape), np.float32)
-            superpose(seen, target, kernels, [phases[camera.channels[k]] for k in members], period, image, tiles)
+                blurred = np.asarray(fft.irfft2(spectrum * transfer, imaged.shape), np.float32)
+            superpose(blurred, target, kernels, [phases[camera.channels[k]] for k in members], period, image, tiles)
     return np.maximum(image, 0.0)
 
 

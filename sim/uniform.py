@@ -11,7 +11,7 @@ from functools import cache, cached_property, partial, reduce
 import numpy as np
 from scipy.special import ndtri
 
-from sim.camera import CameraModel
+from sim.camera import CameraModel, Cfa
 from sim.detection import collection_m2_sr, detect_light
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
@@ -19,7 +19,7 @@ from sim.sensor.amplifiers import CoupledAmplifiers
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.lines import LineGains, LineNoise, Lines
 from sim.sensor.particles import Particles
-from sim.sensor.reading_order import OrderedNoise
+from sim.sensor.reading_order import ReadOutNoise
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, codes_of, image_of, light_of, signal_of
 
@@ -51,15 +51,24 @@ LEVEL = (
 
 #: Values that stand for the noise of a level: over all its points, and the most and the least at one point.
 NOISE_VALUES, MOST_AT_A_POINT, LEAST_AT_A_POINT = 480, 48, 6
+#: Share of the brightest channel to which `Uniform.light_of` is exact, and the most steps that it takes.
+LEAST_UNMIXED, MOST_UNMIXED = 1e-7, 40
 GOLDEN_RATIO = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
 @cache
 def noise_values(points: int) -> FloatArray:
-    """Values of equal weight that stand for a normal variable of mean 0 and standard deviation 1, (points, values).
+    """Choose values of equal weight that stand for a normal variable of mean 0 and standard deviation 1 at each
+    point.
 
-    At each point, the quantiles (i + s) / k, i = 0..k - 1. The offset s differs from point to point by the golden
-    ratio, so that points whose levels are alike sample the distribution k x points times.
+    points : number of points
+
+    Returns (points, values): at each point the quantiles (i + s) / k, i = 0..k - 1. The offset s differs from point
+    to point by the golden ratio, so that points of similar levels sample the distribution k x points times.
+
+    >>> values = noise_values(4)
+    >>> abs(round(float(values.mean()), 9)), round(float(values.std()), 9)
+    (0.0, 1.0)
     """
     count = int(np.clip(NOISE_VALUES // points, LEAST_AT_A_POINT, MOST_AT_A_POINT))
     offset = (0.5 + GOLDEN_RATIO * np.arange(points)) % 1.0
@@ -253,11 +262,11 @@ class Uniform:
         lit = {}
         for channel, rate in rates.items():
             ambient = (self._light.ambient(channel) * collected_s)[..., None]
-            seen = rate * _of_each(partial(self._light.colour, channel), elapsed_s)
-            light = (seen * source_s)[..., None] * field.light
+            detected = rate * _of_each(partial(self._light.colour, channel), elapsed_s)
+            light = (detected * source_s)[..., None] * field.light
             if self.leaks:
                 leaked = self.leaked_s(field) * field.light
-                light = light + (seen * _of_each(self._light.source, elapsed_s))[..., None] * leaked
+                light = light + (detected * _of_each(self._light.source, elapsed_s))[..., None] * leaked
             lit[channel] = light + ambient
         strayed = self.stray_light(lit, field)
         return {c: light * mixed.get(c, np.ones(()))[..., None] + dark for c, light in strayed.items()}
@@ -287,24 +296,82 @@ class Uniform:
         level = dict(zip(electrons, np.broadcast_arrays(*electrons.values()), strict=True))
         shape = next(iter(level.values())).shape
         each = [self.mixing_factors({c: float(v[at]) for c, v in level.items()}) for at in np.ndindex(shape)]
-        return {c: np.array([one[c] for one in each]).reshape(shape) for c in electrons}
+        return {c: np.array([factors[c] for factors in each]).reshape(shape) for c in electrons}
 
-    def mixing_factors(self, electrons: Mapping[str, float]) -> dict[str, float]:
-        """Factor on each channel's mean by charge that moves between neighbouring pixels, from a small uniform mosaic
-        of these electrons; empty where none moves.
+    def mixing_factors(
+        self, electrons: Mapping[str, float], at_px: tuple[float, float] | None = None
+    ) -> dict[str, float]:
+        """Factor on each channel's mean by charge that moves between neighbouring pixels, in even light of these
+        electrons; empty where none moves. The mean is that of the frame, or that at the place `at_px` (row, column):
+        packets far from the output leave more behind.
         """
         if not self._charge.mixes:
             return {}
+        read = self._read_means(electrons, at_px)
+        return {c: read[c] / level if level > 0 else 1.0 for c, level in electrons.items()}
+
+    def _read_means(self, electrons: Mapping[str, float], at_px: tuple[float, float] | None = None) -> dict[str, float]:
+        """Mean electrons that are read by channel, of even light of these; arguments as of `mixing_factors`."""
+        down, across = (
+            _lines_at(comb, None if at_px is None else at_px[axis]) for axis, comb in enumerate(self.read_combs())
+        )
+        read = down @ self.phases_of(electrons) @ across.T
+        where = mosaic.phases(self.camera.cfa)
+        return {c: sum(float(read[at]) for at in where[c]) / len(where[c]) for c in electrons}
+
+    def phases_of(self, electrons: Mapping[str, float]) -> FloatArray:
+        """Electrons (step, step) of the mosaic's phases after neighbouring pixels have shared those of even light, by
+        channel, and before they are clocked out."""
+        if self.exchanges_charge:
+            return self._shared_phases(electrons)
+        parts = self._phases_of_one
+        return np.asarray(sum((e * parts[c] for c, e in electrons.items()), np.zeros(())))
+
+    @cached_property
+    def _phases_of_one(self) -> dict[str, FloatArray]:
+        """`phases_of` one electron in each channel, where what neighbours share is in proportion."""
+        channels = self.camera.channels
+        return {one: self._shared_phases({c: float(c == one) for c in channels}) for one in channels}
+
+    def _shared_phases(self, electrons: Mapping[str, float]) -> FloatArray:
         cfa, size, inner = self.camera.cfa, 12, slice(4, 8)
         tile = mosaic.assemble({c: np.full((size, size), level) for c, level in electrons.items()}, cfa)
-        after = self._charge.trail_tile(self._charge.move_charge(tile))
-        factors = {}
-        for channel, level in electrons.items():
-            where = np.zeros((size, size), bool)
-            for row, col in mosaic.phases(cfa)[channel]:
-                where[row :: mosaic.step(cfa), col :: mosaic.step(cfa)] = True
-            factors[channel] = float(after[inner, inner][where[inner, inner]].mean()) / level if level > 0 else 1.0
-        return factors
+        return phase_means(self._charge.move_charge(tile)[inner, inner], cfa)
+
+    def read_combs(self) -> tuple[FloatArray, FloatArray]:
+        """Electrons (step, rows) and (step, cols) that are read of the lines of each axis, given one electron in every
+        line of one phase of the mosaic: even light P (step, step) by phase is read as down' P across, (rows, cols)."""
+        step = mosaic.step(self.camera.cfa)
+        return self._charge.read_combs(0, step), self._charge.read_combs(1, step)
+
+    def light_of(self, read: Mapping[str, float]) -> dict[str, float]:
+        """Electrons of even light by channel of which these means are read: the inverse of `mixing_factors`.
+
+        Charge that unequal neighbours exchange isn't in proportion: the light is corrected until nothing changes."""
+        if not self._charge.mixes:
+            return dict(read)
+        channels = self.camera.channels
+        if not self.exchanges_charge:
+            return dict(zip(channels, (self._unmixing @ [read[c] for c in channels]).tolist(), strict=True))
+        light, least = dict(read), LEAST_UNMIXED * max(read.values(), default=0.0)
+        for _ in range(MOST_UNMIXED):
+            found = self._read_means(light)
+            light = {c: max(value + read[c] - found[c], 0.0) for c, value in light.items()}
+            if all(abs(read[c] - found[c]) <= least for c in light):
+                break
+        return light
+
+    @cached_property
+    def _unmixing(self) -> FloatArray:
+        """Matrix from the means that are read to the light, by channel."""
+        channels = self.camera.channels
+        one = [self._read_means({c: float(c == lit) for c in channels}) for lit in channels]
+        return np.linalg.inv(np.array([[read[c] for read in one] for c in channels]))
+
+    @property
+    def trails(self) -> bool:
+        """Return whether packets leave charge behind on their way to the output."""
+        return bool(self._charge.trails)
 
     def exchanged_e(self, squares: FloatArray) -> FloatArray:
         """Change (n,) of the middle pixels' electrons by charge that unequal neighbours exchange. `squares`: (n, k, k)
@@ -354,14 +421,14 @@ class Uniform:
 
         Returns (n, k).
         """
-        found = np.zeros(electrons.shape)
+        released_e = np.zeros(electrons.shape)
         for traps in self._charge.traps:
             held, end_s = np.zeros(electrons.shape[1]), 0.0
             for k, (start_s, open_s) in enumerate(zip(begin_s, exposure_s, strict=True)):
                 released, left = traps.release(held, start_s - end_s, open_s)
-                found[k] += released
+                released_e[k] += released
                 held, end_s = traps.fill(left, electrons[k]), start_s + open_s
-        return found
+        return released_e
 
     def shot_e2(self, electrons: FloatArray, gain_db: float = 0.0) -> FloatArray:
         """Variance of the shot noise (e^2) at mean signals, at a gain setting."""
@@ -427,7 +494,7 @@ class Uniform:
 
     def line_gain_std(self, lines: Lines) -> float:
         """Relative standard deviation of the gains of rows or columns."""
-        return float(np.sqrt(sum(one.relative_std**2 for one in self.line_gains if one.lines == lines)))
+        return float(np.sqrt(sum(gains.relative_std**2 for gains in self.line_gains if gains.lines == lines)))
 
     def offset_dn(self, elapsed_s: float, temperature_c: float | None, exposure_s: float) -> float:
         """DN added to the black level, beside the mean of `added_e`."""
@@ -442,7 +509,9 @@ class Uniform:
     def added_e(self) -> FloatArray:
         """Mean of what read-out adds to every pixel, lit or dark (rows, cols)."""
         shape = self.camera.rows, self.camera.cols
-        return sum((np.asarray(one.mean_e(shape)) for one in self._signal.disturbances), np.zeros(shape))
+        return sum(
+            (np.asarray(disturbance.mean_e(shape)) for disturbance in self._signal.disturbances), np.zeros(shape)
+        )
 
     @property
     def lines(self) -> tuple[LineNoise, ...]:
@@ -450,7 +519,7 @@ class Uniform:
         return self._signal.lines
 
     @property
-    def reading_order(self) -> tuple[OrderedNoise, ...]:
+    def reading_order(self) -> tuple[ReadOutNoise, ...]:
         """Noise in the order in which pixels are read."""
         return self._signal.reading_order
 
@@ -495,6 +564,23 @@ class Uniform:
         return means
 
 
+def phase_means(tile: FloatArray, cfa: Cfa) -> FloatArray:
+    """Means (step, step) of the phases of a mosaic's pixels, of a tile of whole periods."""
+    step = mosaic.step(cfa)
+    rows, cols = tile.shape
+    return np.asarray(tile.reshape(rows // step, step, cols // step, step).mean((0, 2)))
+
+
+def _lines_at(combs: FloatArray, at_px: float | None) -> FloatArray:
+    """Electrons (step, step) that the lines of each phase read of those of each phase: means over all lines, or over
+    the nearest ones of a place."""
+    step, lines = combs.shape
+    if at_px is None:
+        return np.array([combs[:, phase::step].mean(1) for phase in range(step)])
+    first = int(np.clip(round(at_px), 0, lines - step)) // step * step
+    return np.asarray(combs[:, first : first + step].T)
+
+
 def _of_each(law: Callable[[float], float], value: FloatArray | float) -> FloatArray:
     """Return a law of one number at every number of an array."""
-    return np.array([law(float(one)) for one in np.ravel(value)]).reshape(np.shape(value))
+    return np.array([law(float(number)) for number in np.ravel(value)]).reshape(np.shape(value))

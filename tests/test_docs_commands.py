@@ -59,16 +59,21 @@ NOT_RUN = {
     "docs/proof.md": "hours: make proof; tests/evaluation/test_sealed.py makes and scores a few",
     "docs/reference/standards.md": "minutes; tests/lab/standards and tests/lab/cli",
     "docs/reference/command-line.md": "written by docs/write_tables.py from the command line itself",
+    "docs/reference/mock-bench.md": "a bench; tests/mocks/test_command.py",
     "docs/reference/instruments.md": "a bench; tests/lab/cli/test_devices.py and tests/mocks/test_command.py",
     "docs/tutorial.md": "minutes; tests/lab/test_pipeline.py",
+    "docs/test-a-driver.md": "tests/test_write_a_driver.py",
     "docs/write-a-driver.md": "tests/test_write_a_driver.py",
 }
 #: Pages that are run here, and which of their blocks: those with one of these words make their own inputs.
 RUN = {
-    "docs/how-to/bring-your-own-recordings.md": ("<<'PY'", "simulate slanted-edge", "simulate colorchecker24"),
+    "docs/how-to/bring-your-own-recordings.md": ("<<'PY'",),
+    "docs/how-to/bring-pictures-and-tables.md": ("<<'PY'", "simulate slanted-edge", "simulate colorchecker24"),
     "docs/reference/camera-file.md": ("--write-camera",),
     "docs/reference/scenes.md": (),  # pictures and cubes of the reader; test_scenes_are_listed
     "docs/reference/rest.md": (),  # test_keys_and_service_on_postgresql
+    "docs/reference/rest-recordings.md": (),  # tests/api/routes
+    "docs/reference/rest-sessions.md": (),  # tests/api/routes
 }
 
 

@@ -15,7 +15,7 @@ from benchmarks.real.page import EXAMPLES, MARK, example_of, page_of
 from benchmarks.real.sets import declared_sets, sets_in
 from benchmarks.real.take_through import Cost, take_through
 from lab.capture_kinds.flat import FlatCapture
-from lab.formats.importers import read_foreign
+from lab.foreign_recordings import read_foreign
 from lab.formats.results import CameraFit, DiagnosisResult, FitResult, NamedEffect, NoiseFit, SpectralFit
 from lab.formats.results.diagnosis import ParameterValue
 

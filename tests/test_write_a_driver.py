@@ -1,5 +1,5 @@
-"""docs/write-a-driver.md, followed to the letter: its files make a package whose own tests, the contract among them,
-pass."""
+"""docs/write-a-driver.md and docs/test-a-driver.md as they stand: their files make a package whose tests, the contract
+among them, pass."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ WRITTEN = re.compile(r"[Ww]rite `([\w.]+)`:\n\n```\w*\n(.*?)```\n", re.DOTALL)
 
 
 def test_the_package_of_the_page_works(tmp_path: Path) -> None:
-    files = dict(WRITTEN.findall((ROOT / "docs" / "write-a-driver.md").read_text(encoding="utf-8")))
+    pages = (ROOT / "docs" / name for name in ("write-a-driver.md", "test-a-driver.md"))
+    files = {name: text for page in pages for name, text in WRITTEN.findall(page.read_text(encoding="utf-8"))}
     assert set(files) == {
         *("cs2000.py", "cs2000.txt", "mock_cs2000.py", "pyproject.toml", "contract.toml", "test_cs2000.py"),
     }

@@ -36,29 +36,31 @@ def list_calibrations(
     service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
 ) -> list[CalibrationRecord]:
     """Calibrations, the newest first, in pages. Every fit of a session is one: a candidate, until it is certified."""
-    found = life.calibrations(service.store, after, limit)
-    page_headers(request, response, life.count_calibrations(service.store), limit, [one.id for one in found])
-    return found
+    listed = life.calibrations(service.store, after, limit)
+    page_headers(
+        request, response, life.count_calibrations(service.store), limit, [calibration.id for calibration in listed]
+    )
+    return listed
 
 
 @router.get("/calibrations/{calibration_id}", dependencies=[READ], responses=answers(401, 404, 422))
 def get_calibration(service: Here, calibration_id: HexId) -> CalibrationDetail:
     """One calibration. `judgements` of a candidate are by the limits of the data folder (`limits.toml`), where it has
     some; those of another are as it was certified. `warnings`: what its session's newest diagnosis says against it."""
-    found = judged_calibration(service, calibration_id)
+    judged = judged_calibration(service, calibration_id)
     return CalibrationDetail(
-        **dict(found), warnings=rejections(service.store, found), has_cameras=_has_cameras(service, found.id)
+        **dict(judged), warnings=rejections(service.store, judged), has_cameras=_has_cameras(service, judged.id)
     )
 
 
 def judged_calibration(service: Service, calibration_id: str) -> CalibrationRecord:
     """A calibration; a candidate by the limits of the data folder. 404 where there is none."""
-    found = _known(service, calibration_id)
-    standing = standing_limits(service.store.root) if found.limits is None else None
+    calibration = _known(service, calibration_id)
+    standing = standing_limits(service.store.root) if calibration.limits is None else None
     if standing is None:
-        return found
-    by_limit = judged(life.figures(service.store, found.id), standing)
-    return found.model_copy(update={"limits": standing, "judgements": by_limit})
+        return calibration
+    by_limit = judged(life.figures(service.store, calibration.id), standing)
+    return calibration.model_copy(update={"limits": standing, "judgements": by_limit})
 
 
 def _has_cameras(service: Service, calibration_id: str) -> bool:
@@ -66,9 +68,6 @@ def _has_cameras(service: Service, calibration_id: str) -> bool:
         return bool(camera_models.record(service.store, calibration_id).sides)
     except InputError:
         return False
-
-
-# --- figures ----------------------------------------------------------------------------------------------------------
 
 
 @functools.lru_cache(maxsize=32)
@@ -79,23 +78,23 @@ def _figures(store: Store, fit: str) -> tuple[Figure, ...]:
 
 def _told(service: Service, figures: tuple[Figure, ...]) -> list[FigureOfFit]:
     limits = standing_limits(service.store.root)
-    found = []
-    for one in figures:
-        limit = next((limit for limit in (limits.limit if limits else ()) if limit.concerns(one)), None)
-        found.append(
+    listed = []
+    for figure in figures:
+        limit = next((limit for limit in (limits.limit if limits else ()) if limit.concerns(figure)), None)
+        listed.append(
             FigureOfFit(
-                figure=one.name,
-                place=one.place,
-                title=one.title,
-                unit=one.unit,
-                side=one.side,
-                value=one.value,
-                std=one.std,
+                figure=figure.name,
+                place=figure.place,
+                title=figure.title,
+                unit=figure.unit,
+                side=figure.side,
+                value=figure.value,
+                std=figure.std,
                 good=None if limit is None else limit.good,
-                mark=None if limit is None else limit.judge(one),
+                mark=None if limit is None else limit.judge(figure),
             )
         )
-    return found
+    return listed
 
 
 def _newest_figures(service: Service, source: str, what: str) -> list[FigureOfFit]:
@@ -124,15 +123,12 @@ def recordings_figures(service: Here, recordings_id: HexId) -> list[FigureOfFit]
     return _newest_figures(service, str(service.recordings(recordings_id)), f"recordings {recordings_id}")
 
 
-# --- certifying -------------------------------------------------------------------------------------------------------
-
-
 @router.get("/calibrations/{calibration_id}/drafted-limits", dependencies=[READ], responses=answers(401, 404, 422))
 def drafted_limits(service: Here, calibration_id: HexId) -> DraftedLimits:
     """Limits drafted from what the same cameras had before: where the next calibration of an unchanged camera lies with
     99 %. They say what is usual; what a camera has to reach, somebody decides. Nothing is kept."""
     wanted = _known(service, calibration_id).id
-    found, whence = life.drafted_limits(service.store, wanted)
+    drafts, whence = life.drafted_limits(service.store, wanted)
     words = f"Drafted from {len(whence)} earlier calibrations of these cameras: what is usual for them."
     if wanted in whence:
         others = f" and {len(whence) - 1} earlier" if len(whence) > 1 else " alone"
@@ -143,14 +139,14 @@ def drafted_limits(service: Here, calibration_id: HexId) -> DraftedLimits:
         valid_days=standing.valid_days if standing else None,
         limits=tuple(
             DraftedLimit(
-                figure=one.figure,
-                title=plain_name(one.figure, one.place).replace(", *", ", every edge"),
-                unit=unit_of(one.figure),
-                side=one.side,
-                place=one.place,
-                good=one.good,
+                figure=draft.figure,
+                title=plain_name(draft.figure, draft.place).replace(", *", ", every edge"),
+                unit=unit_of(draft.figure),
+                side=draft.side,
+                place=draft.place,
+                good=draft.good,
             )
-            for one in found
+            for draft in drafts
         ),
     )
 
@@ -165,9 +161,9 @@ def certify_calibration(
     """Certify a candidate against limits, by the holder of the key; what the same cameras had before is superseded.
     422, with a reason for each, where figures are bad or missing, or in the warning band and that isn't accepted; 409
     for what is no candidate."""
-    found = _known(service, calibration_id)
-    if found.state != "candidate":
-        raise Conflict(f"calibration {calibration_id} is {found.state}; only a candidate can be certified")
+    calibration = _known(service, calibration_id)
+    if calibration.state != "candidate":
+        raise Conflict(f"calibration {calibration_id} is {calibration.state}; only a candidate can be certified")
     limits = asked.stated() or standing_limits(service.store.root)
     if limits is None:
         raise HTTPException(422, "limits: the data folder has no limits.toml; put one there, or send the limits")
@@ -175,10 +171,10 @@ def certify_calibration(
 
 
 def _certified(service: Service, calibration_id: str) -> CalibrationRecord:
-    found = _known(service, calibration_id)
-    if found.certified is None:
-        raise Conflict(f"calibration {calibration_id} is a {found.state}; certify it, then it has a certificate")
-    return found
+    calibration = _known(service, calibration_id)
+    if calibration.certified is None:
+        raise Conflict(f"calibration {calibration_id} is a {calibration.state}; certify it, then it has a certificate")
+    return calibration
 
 
 @router.get(
@@ -190,12 +186,12 @@ def _certified(service: Service, calibration_id: str) -> CalibrationRecord:
 def certificate_of_calibration(service: Here, calibration_id: HexId) -> HTMLResponse:
     """The certificate as a page to print, or to keep as a PDF: limits, figures with their uncertainties, verdict,
     serial numbers, hash. 409 before it is certified."""
-    found = _certified(service, calibration_id)
+    certified = _certified(service, calibration_id)
     try:
-        runs = service.public_runs(service.store.runs(found.session_id))
+        runs = service.public_runs(service.store.runs(certified.session_id))
     except InputError:  # the session was deleted
         runs = ()
-    page = certificate_page(service.store, found, runs)
+    page = certificate_page(service.store, certified, runs)
     return HTMLResponse(service.public.within(page), headers={"Content-Security-Policy": REPORT_POLICY})
 
 
@@ -215,9 +211,9 @@ def revoke_calibration(
     key: Annotated[StoredKey, Depends(Demand(Permission.CALIBRATE))],
 ) -> CalibrationRecord:
     """Take a certificate back, with the reason, by the holder of the key. 409 for a calibration without one."""
-    found = _known(service, calibration_id)
+    calibration = _known(service, calibration_id)
     try:
-        return life.revoke(service.store, found.id, key.name, asked.why)
+        return life.revoke(service.store, calibration.id, key.name, asked.why)
     except InputError as error:
         raise Conflict(str(error)) from None
 

@@ -28,9 +28,6 @@ from lab.report.compare import render_comparison
 router = APIRouter(tags=["calibrations"])
 
 
-# --- camera models ----------------------------------------------------------------------------------------------------
-
-
 def _fields(service: Service, record: CameraModelRecord) -> CameraModels:
     recordings_id = service.inbox.id_of(record.source)
     of_session = recordings_id is None and record.kind != "sent"
@@ -55,9 +52,9 @@ def list_camera_models(
 ) -> list[CameraModels]:
     """The camera models of fits (`fitted`), of diagnoses (`improved`: with the effects that were named), and those that
     were sent in (`sent`), the newest first, in pages. `sides` is empty for results from before models were kept."""
-    found = camera_models.records(service.store, after, limit)
-    page_headers(request, response, camera_models.count(service.store), limit, [one.id for one in found])
-    return [_fields(service, one) for one in found]
+    models = camera_models.records(service.store, after, limit)
+    page_headers(request, response, camera_models.count(service.store), limit, [model.id for model in models])
+    return [_fields(service, model) for model in models]
 
 
 @router.post(
@@ -72,8 +69,8 @@ async def send_camera_model(service: Here, request: Request, response: Response)
     .tar or .tar.gz. Each is read completely before it is kept. A traced lens is sent as its table, for no lens is
     traced here."""
     async with arrived(service, request, service.limits.model_bytes) as came:
-        found = await asyncio.to_thread(take_cameras, came.place, came.archive, service.limits.model_bytes)
-        id = await asyncio.to_thread(camera_models.bring_in, service.store, found)
+        content = await asyncio.to_thread(take_cameras, came.place, came.archive, service.limits.model_bytes)
+        id = await asyncio.to_thread(camera_models.bring_in, service.store, content)
     response.headers["Location"] = f"/api/v1/camera-models/{id}"
     return await asyncio.to_thread(_whole, service, id)
 
@@ -114,8 +111,6 @@ def camera_model_archive(service: Here, model_id: HexId, form: Form) -> Response
     return sent(packed(((file.name, file.read_bytes()) for file in files), form), f"camera-{model_id}", form)
 
 
-# --- comparisons ------------------------------------------------------------------------------------------------------
-
 Source = Annotated[
     str,
     Query(
@@ -136,7 +131,7 @@ def _fit(service: Service, what: str, id: str) -> FitResult:
     """The fit that an id stands for; 404 where there is none."""
     store = service.store
     try:
-        found = store.result(id)
+        result = store.result(id)
     except InputError:
         kept = store.results(_source(service, id), "fit")[:1]
         if not kept:
@@ -144,18 +139,18 @@ def _fit(service: Service, what: str, id: str) -> FitResult:
                 404, f"{what}: {id!r} has no fit; GET /api/v1/calibrations lists those of sessions, or start a fit"
             ) from None
         return FitResult.model_validate(kept[0].document)
-    if found.kind in ("report", "pipeline"):
-        found = store.result(ReportFile.model_validate(found.document).results["fit"])
-    if found.kind != "fit":
-        raise HTTPException(404, f"{what}: {id!r} is a result of the kind {found.kind}; give one of a fit")
-    return FitResult.model_validate(found.document)
+    if result.kind in ("report", "pipeline"):
+        result = store.result(ReportFile.model_validate(result.document).results["fit"])
+    if result.kind != "fit":
+        raise HTTPException(404, f"{what}: {id!r} is a result of the kind {result.kind}; give one of a fit")
+    return FitResult.model_validate(result.document)
 
 
 def _name_of(service: Service, id: str) -> str:
     """What the source of a fit is called, where it has a name, with its time and id."""
     with contextlib.suppress(InputError):
-        found = life.calibration(service.store, id)
-        return f"{found.name}, fitted {found.created:%Y-%m-%d %H:%M} UTC ({id})"
+        calibration = life.calibration(service.store, id)
+        return f"{calibration.name}, fitted {calibration.created:%Y-%m-%d %H:%M} UTC ({id})"
     with contextlib.suppress(InputError):
         session = service.store.session(id)
         return f"{session.name or id}, the newest fit ({id})"
@@ -184,12 +179,12 @@ def compare_calibrations(
     try:
         failed = failures(result, [FailRule.parse(rule) for rule in fail_on])
     except InputError as error:
-        said = (
+        problem = (
             str(error)
             .replace("--fail-on", "fail_on")
             .replace("`calibench compare A B --all`", "`changes` of the answer without it")
         )
-        raise HTTPException(422, said) from None
+        raise HTTPException(422, problem) from None
     return Comparison(comparison=result, failing=tuple(failed))
 
 

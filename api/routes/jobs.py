@@ -147,12 +147,12 @@ def start_recordings_job(
     station = service.station(start.station)
     let_go = service.live.hold(station)
     try:
-        own = station_of(source_recordings(folder, lambda: None), station, service.live.connect)
+        station_of_set = station_of(source_recordings(folder, lambda: None), station, service.live.connect)
     finally:
         let_go()
-    capturer = service.live.capturer(own)
+    capturer = service.live.capturer(station_of_set)
     job_id = service.jobs.submit(
-        "pipeline", folder, resolve=limits, capturer=capturer, station=own, engine=start.engine
+        "pipeline", folder, resolve=limits, capturer=capturer, station=station_of_set, engine=start.engine
     )
     return accepted(service, job_id, response)
 
@@ -176,9 +176,9 @@ def list_jobs(
     if session_id is not None and recordings_id is not None:
         raise HTTPException(422, "session_id, recordings_id: a job has one source; leave one out")
     source = session_id if recordings_id is None else str(service.recordings(recordings_id))
-    found = service.jobs.jobs(after, limit, source)
-    page_headers(request, response, service.jobs.count_jobs(source), limit, [info.id for info in found])
-    return [_job(service, info) for info in found]
+    jobs = service.jobs.jobs(after, limit, source)
+    page_headers(request, response, service.jobs.count_jobs(source), limit, [info.id for info in jobs])
+    return [_job(service, info) for info in jobs]
 
 
 @router.get("/jobs/{job_id}", tags=["jobs"], dependencies=[READ], responses=answers(401, 404, 422))

@@ -39,7 +39,7 @@ def _duration_s(store: Store, session_id: str, hour: int) -> float:
 
 def _told(service: Service) -> list[QueueEntry]:
     live, store = service.live, service.store
-    waiting = [one for one in queue(store) if live.find(one.id) is None]
+    waiting = [info for info in queue(store) if live.find(info.id) is None]
     at = now()
     busy_until: dict[str, datetime | None] = {}
     for session in live.running():
@@ -48,16 +48,16 @@ def _told(service: Service) -> list[QueueEntry]:
         busy_until |= dict.fromkeys(session.station.addresses, until)
     expected = expected_times(
         waiting,
-        {one.id: store.station(one.id).addresses for one in waiting},
-        {one.id: _duration_s(store, one.id, int(at.timestamp()) // 3600) for one in waiting},
+        {info.id: store.station(info.id).addresses for info in waiting},
+        {info.id: _duration_s(store, info.id, int(at.timestamp()) // 3600) for info in waiting},
         busy_until,
         at,
     )
-    told = []
+    entries = []
     for place, one in enumerate(waiting, start=1):
         start, end = expected.get(one.id, (None, None))
         request = kept_request(store, one.id)
-        told.append(
+        entries.append(
             QueueEntry(
                 **one.model_dump(exclude={"place", "held"}),
                 place=place,
@@ -68,7 +68,7 @@ def _told(service: Service) -> list[QueueEntry]:
                 can_copy=request is not None,
             )
         )
-    return told
+    return entries
 
 
 @router.get("/queue", dependencies=[READ], responses=answers(401))
@@ -115,7 +115,7 @@ def change_request(
     check_then(service, request, start)
     station = service.station(start.station)
     start.plan(station).steps(station)  # refused before anything changes
-    waits = next((one for one in queue(service.store) if one.id == session_id), None)
+    waits = next((info for info in queue(service.store) if info.id == session_id), None)
     if waits is None or service.live.find(session_id) is not None or service.store.runs(session_id):
         raise Conflict(
             f"session {session_id} is {service.state(info)}; only one that waits in the queue, and never ran, can be "
@@ -134,13 +134,13 @@ def change_request(
 
 def _stations(service: Service) -> tuple[dict[str, Station], dict[str, str]]:
     """Return the stations by name, and by the same names why the files of others can't be used."""
-    found, unusable = {}, {}
+    stations, unusable = {}, {}
     for name in service.station_files():
         try:
-            found[name] = service.station(name)
+            stations[name] = service.station(name)
         except (InputError, OSError, HTTPException) as error:  # a file that is gone meanwhile: 404
             unusable[name] = one_line(error)
-    return found, unusable
+    return stations, unusable
 
 
 @router.post("/halt", responses=answers(401, 403, 404, 422))
@@ -168,7 +168,9 @@ def halt(
     for id in ended:
         if (session := live.find(id)) is not None:
             busy[key_of(session.station)] = session.station
-            if key_of(session.station) not in {key_of(one) for one in stations.values()}:  # it has no file any more
+            if key_of(session.station) not in {
+                key_of(station) for station in stations.values()
+            }:  # it has no file any more
                 stations[f"session {id}"] = session.station
     answering = list(ended.values())
     for one in {key_of(one): one for one in stations.values()}.values():

@@ -45,7 +45,7 @@ def _recordings(id: str, manifest: dict[str, Any], warnings: tuple[str, ...] = (
 def _as_parameters(text: str) -> str:
     """A sentence about the command line's options as one about this route's parameters."""
     text = re.sub(r"--from (?=[a-z])", "format ", text)
-    return re.sub(r"--([a-z]+(?:-[a-z]+)*)", lambda found: found[1].replace("-", "_"), text)
+    return re.sub(r"--([a-z]+(?:-[a-z]+)*)", lambda match: match[1].replace("-", "_"), text)
 
 
 def _foreign(asked: SentAs) -> Foreign | None:
@@ -93,16 +93,16 @@ async def send_recordings(
     limits = service.limits
     async with arrived(service, request, limits.upload_bytes) as sent:
         try:
-            id, found = await asyncio.to_thread(
+            id, warnings = await asyncio.to_thread(
                 service.inbox.take_in, sent.place, sent.archive, limits.unpacked_bytes, limits.unpacked_files, foreign
             )
         except TooMuch:
             raise
         except InputError as error:
             raise InputError(_as_parameters(str(error)) if foreign is not None else str(error)) from None
-        lines = tuple(sent.told(line) for line in found.warnings)
+        lines = tuple(sent.told(line) for line in warnings.warnings)
     response.headers["Location"] = f"/api/v1/recordings/{id}"
-    return _recordings(id, found.manifest.model_dump(include={"name", "notes", "cameras", "captures"}), lines)
+    return _recordings(id, warnings.manifest.model_dump(include={"name", "notes", "cameras", "captures"}), lines)
 
 
 @router.get(
@@ -122,8 +122,8 @@ def list_recordings(
 def get_recordings(service: Here, recordings_id: HexId) -> RecordingsDetail:
     """One recording set, with its captures by kind and its results."""
     folder = str(service.recordings(recordings_id))
-    found = service.pictures.recordings(recordings_id)
-    counts = Counter((capture.kind, capture.side) for capture in found.captures())
+    recordings = service.pictures.recordings(recordings_id)
+    counts = Counter((capture.kind, capture.side) for capture in recordings.captures())
     results = service.store.newest_results(folder)
     return RecordingsDetail(
         **_recordings(recordings_id, service.inbox.manifest(recordings_id)).model_dump(),
@@ -131,9 +131,6 @@ def get_recordings(service: Here, recordings_id: HexId) -> RecordingsDetail:
         verdict=verdict_of(service.store, results["diagnose"]) if "diagnose" in results else None,
         results=results,
     )
-
-
-# --- captures ---------------------------------------------------------------------------------------------------------
 
 
 def _capture(recordings_id: str, number: int, capture: Capture) -> RecordedCapture:
@@ -153,10 +150,10 @@ def _capture(recordings_id: str, number: int, capture: Capture) -> RecordedCaptu
 
 def _known_capture(service: Service, recordings_id: str, number: int) -> Capture:
     service.recordings(recordings_id)
-    found = service.pictures.recordings(recordings_id).captures()
-    if number > len(found):
-        raise HTTPException(404, f"recordings {recordings_id}: no capture {number}; they have {len(found)}")
-    return found[number - 1]
+    captures = service.pictures.recordings(recordings_id).captures()
+    if number > len(captures):
+        raise HTTPException(404, f"recordings {recordings_id}: no capture {number}; they have {len(captures)}")
+    return captures[number - 1]
 
 
 @router.get(
@@ -181,16 +178,20 @@ def list_recorded_captures(
     service.recordings(recordings_id)
     every = enumerate(service.pictures.recordings(recordings_id).captures(), start=1)
     words = search.lower().split()
-    found = [
-        (n, one)
-        for n, one in every
-        if kind in (None, one.kind) and side in (None, one.side) and all(word in one.id.lower() for word in words)
+    numbered = [
+        (n, capture)
+        for n, capture in every
+        if kind in (None, capture.kind)
+        and side in (None, capture.side)
+        and all(word in capture.id.lower() for word in words)
     ]
     if order == "newest":
-        found.reverse()
-    page = [(n, one) for n, one in found if after is None or (n < after if order == "newest" else n > after)][:limit]
-    page_headers(request, response, len(found), limit, [str(n) for n, _ in page])
-    return [_capture(recordings_id, n, one) for n, one in page]
+        numbered.reverse()
+    page = [
+        (n, capture) for n, capture in numbered if after is None or (n < after if order == "newest" else n > after)
+    ][:limit]
+    page_headers(request, response, len(numbered), limit, [str(n) for n, _ in page])
+    return [_capture(recordings_id, n, capture) for n, capture in page]
 
 
 @router.get(

@@ -53,9 +53,6 @@ from sim.camera import Side
 router = APIRouter()
 
 
-# --- stations ---------------------------------------------------------------------------------------------------------
-
-
 def station_state(service: Service, name: str) -> StationState:
     """What a station file says, or why it can't be used."""
     try:
@@ -87,9 +84,6 @@ def list_stations(service: Here) -> list[StationState]:
     return [station_state(service, name) for name in service.station_files()]
 
 
-# --- sessions ---------------------------------------------------------------------------------------------------------
-
-
 def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
     live, state = service.live.find(info.id), service.state(info)
     if live is not None and state in ("finished", "interrupted", "failed"):
@@ -102,8 +96,8 @@ def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
     return fields | {"error": service.public.or_none(error)}
 
 
-def _listed(service: Service, info: SessionInfo, told: dict[str, SessionOverview]) -> dict[str, Any]:
-    overview = told.get(info.id, SessionOverview())  # it was deleted meanwhile
+def _listed(service: Service, info: SessionInfo, by_session: dict[str, SessionOverview]) -> dict[str, Any]:
+    overview = by_session.get(info.id, SessionOverview())  # it was deleted meanwhile
     return _fields(service, info) | overview.model_dump() | {"tags": tags_of(info.notes)}
 
 
@@ -133,10 +127,10 @@ def session_request(service: Here, session_id: SessionId) -> SessionStart:
     """What a session was asked to start with, as `POST /sessions` takes it: to be copied, or edited while it waits. 404
     where it wasn't started by a service."""
     service.session(session_id)
-    found = kept_request(service.store, session_id)
-    if found is None:
+    kept = kept_request(service.store, session_id)
+    if kept is None:
         raise HTTPException(404, f"session {session_id}: what it was asked with isn't kept; start one by hand")
-    return found
+    return kept
 
 
 def stored_session(service: Service, session_id: str) -> StoredSession:
@@ -170,11 +164,11 @@ def list_sessions(
 ) -> list[ListedSession]:
     """Sessions, newest first, in pages: all, or those that are searched for."""
     only = None if verdict is None else sessions_of_verdict(service.store, verdict)
-    found = service.store.sessions(after, limit, search=search, only=only)
+    infos = service.store.sessions(after, limit, search=search, only=only)
     total = service.store.count_sessions(search=search, only=only)
-    page_headers(request, response, total, limit, [info.id for info in found])
-    told = overviews(service.store, [info.id for info in found])
-    return [ListedSession(**_listed(service, info, told)) for info in found]
+    page_headers(request, response, total, limit, [info.id for info in infos])
+    by_session = overviews(service.store, [info.id for info in infos])
+    return [ListedSession(**_listed(service, info, by_session)) for info in infos]
 
 
 @router.post(
@@ -205,14 +199,14 @@ def start_session(service: Here, request: Request, start: SessionStart, response
 @router.get("/sessions/{session_id}", tags=["sessions"], dependencies=[READ], responses=answers(401, 404, 422))
 def get_session(service: Here, session_id: SessionId) -> SessionDetail:
     """One session, with its provenance."""
-    found = known(missing_session(session_id), lambda: service.store.details(session_id))
+    details = known(missing_session(session_id), lambda: service.store.details(session_id))
     return SessionDetail(
-        **_listed(service, found.info, overviews(service.store, [session_id])),
+        **_listed(service, details.info, overviews(service.store, [session_id])),
         can_copy=kept_request(service.store, session_id) is not None,
         then=then_of(service.store, session_id),
-        progress=service.progress(session_id) if found.info.closed is None else None,
+        progress=service.progress(session_id) if details.info.closed is None else None,
         asks=service.asks(session_id),
-        runs=service.public_runs(found.runs),
+        runs=service.public_runs(details.runs),
         captures=tuple(
             CaptureCount(kind=kind, side=side, captures=n)  # type: ignore[arg-type]
             for (kind, side), n in sorted(service.store.count_captures(session_id).items())
@@ -329,7 +323,7 @@ async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> A
     def look() -> StoredSession:
         return stored_session(service, session_id)
 
-    seen = None
+    last_state = None
     live = service.live.find(session_id)
     if live is None:  # another process runs it, or nobody does
         async for told in watched(look, lambda session: session.state in OVER, "state", stopping, service.changed):
@@ -337,10 +331,10 @@ async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> A
         return
     yield event("state", await asyncio.to_thread(look))
     async for progress in live.follow(stopping):
-        text = live.once(progress, lambda one: service.told(one).model_dump_json())
+        text = live.once(progress, lambda state: service.told(state).model_dump_json())
         yield ServerSentEvent(event="progress", data=text)
-        if (progress.state, live.pausing) != seen:
-            seen = (progress.state, live.pausing)
+        if (progress.state, live.pausing) != last_state:
+            last_state = (progress.state, live.pausing)
             yield event("state", await asyncio.to_thread(look))
     if not stopping.is_set():
         yield event("end", await asyncio.to_thread(look))
@@ -362,9 +356,6 @@ def session_events(service: Here, session_id: SessionId) -> EventSourceResponse:
     """Follow a session."""
     service.session(session_id)
     return stream(lambda stopping: _follow(service, session_id, stopping))
-
-
-# --- captures ---------------------------------------------------------------------------------------------------------
 
 
 def _capture(info: CaptureInfo) -> StoredCapture:
@@ -404,7 +395,7 @@ def list_captures(
     limit: Limit = PAGE,
 ) -> list[StoredCapture]:
     """The captures of a session, in the order in which they were taken or the newest first, in pages."""
-    found = known(
+    capture = known(
         missing_session(session_id),
         lambda: service.store.captures(
             session_id,
@@ -421,8 +412,8 @@ def list_captures(
         for of, n in service.store.count_captures(session_id, search).items()
         if kind in (None, of[0]) and side in (None, of[1])
     )
-    page_headers(request, response, total, limit, [str(info.id) for info in found])
-    return [_capture(info) for info in found]
+    page_headers(request, response, total, limit, [str(info.id) for info in capture])
+    return [_capture(info) for info in capture]
 
 
 @router.get(

@@ -37,8 +37,10 @@ def list_connected(service: Here) -> list[ConnectedDevice]:
     try:
         with _LOOKING:  # the libraries that list cameras aren't made for two at a time
             return [
-                ConnectedDevice(address=found.address, what=service.public(found.what), driver=found.driver)
-                for found in discovery.find_all()
+                ConnectedDevice(
+                    address=instrument.address, what=service.public(instrument.what), driver=instrument.driver
+                )
+                for instrument in discovery.find_all()
             ]
     except InstrumentError as error:
         raise DeviceError(str(error)) from error
@@ -163,7 +165,7 @@ def check_station(
 )
 def device_transcript(service: Here, name: StationName, device: DeviceName) -> PlainTextResponse:
     """What went over a device's wire in the latest check that kept it: `>` sent, `<` received."""
-    found = _device(service, name, service.station(name), device)
-    if found.transcript is None:
+    checked = _device(service, name, service.station(name), device)
+    if checked.transcript is None:
         raise HTTPException(404, f'no transcript of {device} is kept; check it with {{"transcript": true}}')
     return PlainTextResponse(service.public.within(service.checks.transcript(name, device).read_text(encoding="ascii")))

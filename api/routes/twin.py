@@ -76,18 +76,20 @@ def _sealed(service: Service, prediction_id: str) -> SealedPrediction:
     return open_seal(file)
 
 
-def _fields(service: Service, prediction_id: str, found: SealedPrediction) -> StoredPrediction:
+def _fields(service: Service, prediction_id: str, prediction: SealedPrediction) -> StoredPrediction:
     file = _folder(service) / f"{prediction_id}.json"
     return StoredPrediction(
         id=prediction_id,
         sha256=seal_path(file).read_text(encoding="utf-8").split()[0],
         created=datetime.fromtimestamp(file.stat().st_mtime, UTC),
-        camera_model=found.model,
-        plan=found.plan,
-        changes=found.changes.model_dump(mode="json", exclude_none=True),
-        numbers={side: len(one.numbers) for side, one in found.sides.items()},
-        names={side: tuple(name.told for name in one.names) for side, one in found.sides.items()},
-        not_predicted=tuple(skipped.reason for one in found.sides.values() for skipped in one.skipped),
+        camera_model=prediction.model,
+        plan=prediction.plan,
+        changes=prediction.changes.model_dump(mode="json", exclude_none=True),
+        numbers={side: len(sealed_side.numbers) for side, sealed_side in prediction.sides.items()},
+        names={side: tuple(name.told for name in sealed_side.names) for side, sealed_side in prediction.sides.items()},
+        not_predicted=tuple(
+            skipped.reason for sealed_side in prediction.sides.values() for skipped in sealed_side.skipped
+        ),
     )
 
 
@@ -102,20 +104,20 @@ def make_prediction(service: Here, asked: PredictionStart, response: Response) -
     plan_id, plan = _set(service, asked.plan)
     fitted = None if asked.fitted is None else _read(_set(service, asked.fitted)[1])
     with _one_at_a_time():
-        found = predict(
+        prediction = predict(
             models, _read(plan), changes, model=asked.camera_model, light_std=asked.light_std_percent / 100.0,
             fitted=fitted,
         ).model_copy(update={"plan": plan_id})  # fmt: skip
     folder = _folder(service)
     folder.mkdir(parents=True, exist_ok=True)
     partial = folder / f".{threading.get_ident()}.json"
-    id = seal(found, partial)[:16]
+    id = seal(prediction, partial)[:16]
     partial.unlink()
     seal_path(partial).unlink()
     if not (folder / f"{id}.json").is_file():  # the same prediction stays the one that was sealed first
-        seal(found, folder / f"{id}.json")
+        seal(prediction, folder / f"{id}.json")
     response.headers["Location"] = f"/api/v1/predictions/{id}"
-    return _fields(service, id, found)
+    return _fields(service, id, prediction)
 
 
 @router.get("/predictions", dependencies=[READ], responses=answers(401, 422) | {200: {"headers": HEADERS}})
@@ -128,7 +130,10 @@ def list_predictions(
     page = page_of(every, after, limit, "prediction")
     page_headers(request, response, len(every), limit, page)
     folder = _folder(service)
-    return [_fields(service, one, read_result(SealedPrediction, folder / f"{one}.json")) for one in page]
+    return [
+        _fields(service, prediction_id, read_result(SealedPrediction, folder / f"{prediction_id}.json"))
+        for prediction_id in page
+    ]
 
 
 @router.get("/predictions/{prediction_id}", dependencies=[READ], responses=answers(401, 404, 422))
@@ -179,7 +184,8 @@ def camera_model_budget(
     model_id: HexId,
     use: Annotated[str, Query(max_length=200, description="some of MTF50, patches, variance, dark mean, by commas")],
     station: Annotated[
-        str | None, Query(max_length=100, description="rank its sequences by error reduced for a minute of lab time")
+        str | None,
+        Query(max_length=100, description="rank its sequences by the reduction per minute of lab time"),
     ] = None,
 ) -> dict[Side, BudgetResult]:
     """What matters for a use of each camera at the model's present uncertainty, as `calibench twin budget` tells it."""

@@ -19,7 +19,8 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose import examine
 from lab.errors import InputError
 from lab.fit import fit_recording_set
-from lab.formats.importers import ImportOptions, read_foreign
+from lab.foreign_recordings import read_foreign
+from lab.formats.importers import ImportOptions
 from lab.formats.recording_set import RecordingSet, read
 from lab.twin.changes import Changes
 from lab.twin.predict import predict

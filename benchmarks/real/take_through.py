@@ -55,7 +55,8 @@ def take_through(
     from lab.diagnose import diagnose
     from lab.fit import FOR_DIAGNOSIS, fit_recording_set
     from lab.fit.spectral.mean_table import fit_mean_table
-    from lab.formats.importers import ImportOptions, read_foreign
+    from lab.foreign_recordings import read_foreign
+    from lab.formats.importers import ImportOptions
     from lab.formats.importers.images import read_camera_file
     from lab.formats.recording_set import read, write
 

@@ -114,10 +114,10 @@ class AlpacaCamera(SingleFrameCamera):
     def _set(self, features: CameraFeatures, exposure_s: float, gain: float | None) -> float:
         if gain is not None:
             features.set("gain", int(gain))
-            if (found := features.get("gain")) != int(gain):
+            if (set_gain := features.get("gain")) != int(gain):
                 raise InstrumentError(
-                    f"{self._who}: told a gain of {gain:g} it says {found}; its driver counts otherwise: leave the "
-                    "gain at 0 dB without gain_db_per_unit"
+                    f"{self._who}: a gain of {gain:g} was set and {set_gain} is read; its driver counts otherwise: "
+                    "leave the gain at 0 dB without gain_db_per_unit"
                 )
         return exposure_s
 
@@ -136,7 +136,7 @@ class AlpacaCamera(SingleFrameCamera):
         self._await_idle()
         self._device.put("startexposure", Duration=exposure_s, Light=True)
 
-    def _exposed(self) -> bool:
+    def _has_exposed(self) -> bool:
         if self._device.get("imageready"):
             return True
         if self._device.get("camerastate") == _ERROR:
@@ -159,12 +159,12 @@ class AlpacaCamera(SingleFrameCamera):
         return picture.astype(np.uint16)
 
     def _temperature_c(self) -> float | None:
-        found = self._device.get_if_there("ccdtemperature")
-        return None if found is None else float(found)
+        temperature_c = self._device.get_if_there("ccdtemperature")
+        return None if temperature_c is None else float(temperature_c)
 
     def _settings(self) -> dict[str, Setting]:
-        told = {name: self._device.get_if_there(name) for name in _SETTINGS}
-        return {name: value for name, value in told.items() if value is not None}
+        settings = {name: self._device.get_if_there(name) for name in _SETTINGS}
+        return {name: value for name, value in settings.items() if value is not None}
 
     def _abort(self) -> None:
         for able, method in (("canabortexposure", "abortexposure"), ("canstopexposure", "stopexposure")):

@@ -84,12 +84,12 @@ def _introspection() -> Any:
 
 
 def _error_of(error: Exception, who: str, doing: str) -> InstrumentError:
-    said = " ".join(str(getattr(error, "message", error)).split())
-    if "imeout" in said:
+    message = " ".join(str(getattr(error, "message", error)).split())
+    if "imeout" in message:
         return NoAnswer(f"{who}: no answer while {doing}; check the cable, the power and the firewall")
-    if "Not found" in said or "not found" in said or "Invalid" in said:
-        return InstrumentError(f"{who}: {doing} failed ({said}); check that the camera has it")
-    return Disconnected(f"{who}: {doing} failed ({said}); plug it in again, the next call reconnects")
+    if "Not found" in message or "not found" in message or "Invalid" in message:
+        return InstrumentError(f"{who}: {doing} failed ({message}); check that the camera has it")
+    return Disconnected(f"{who}: {doing} failed ({message}); plug it in again, the next call reconnects")
 
 
 class _AravisFeatures:
@@ -248,12 +248,15 @@ class AravisCamera(GenicamCamera):
         library = _library()
         library.update_device_list()
         for index in range(library.get_n_devices()):
-            told = (
+            texts = (
                 library.get_device_vendor(index),
                 library.get_device_model(index),
                 library.get_device_serial_nbr(index),
             )
-            yield library.get_device_id(index), f"{' '.join(filter(None, told))} ({library.get_device_protocol(index)})"
+            yield (
+                library.get_device_id(index),
+                f"{' '.join(filter(None, texts))} ({library.get_device_protocol(index)})",
+            )
 
     @cached_property
     def _device(self) -> Apart:
@@ -280,8 +283,8 @@ class AravisCamera(GenicamCamera):
         self._call("halt")
 
     def _grab(self, timeout_s: float) -> Grabbed | None:
-        found = self._call("grab", timeout_s, longer_s=timeout_s)
-        return None if found is None else Grabbed(**found)
+        grabbed = self._call("grab", timeout_s, longer_s=timeout_s)
+        return None if grabbed is None else Grabbed(**grabbed)
 
     def _release(self) -> None:
         self._device.end()

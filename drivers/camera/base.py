@@ -58,7 +58,7 @@ class Frame:
 
 
 class Camera(Instrument):
-    """A camera that takes one frame when told to.
+    """A camera that takes one frame a trigger.
 
     A frame is `arm` (ready for a trigger), `fire` (a software trigger) and `collect` (wait for it and read it out):
     `capture` does all three; `capture_together` interleaves them for cameras wired to trigger one another.
@@ -120,7 +120,7 @@ class StreamingCamera(Camera):
     `drivers.camera.stream.FrameStream` takes series with such cameras. A frame that fails ends nothing: the next one
     follows."""
 
-    #: Whether the computer triggers it after the camera that leads, as it isn't wired; told by `arm`.
+    #: Whether the computer triggers it after the camera that leads, as it isn't wired; set by `arm`.
     follows_by_software = False
 
     @abstractmethod

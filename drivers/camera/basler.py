@@ -33,7 +33,7 @@ def pylon_library() -> Any:
     return pylon
 
 
-def _said(error: Exception) -> str:
+def _message_of(error: Exception) -> str:
     """Return what the library says, without the place in its sources."""
     return " ".join(str(error).split(" : ")[0].split())
 
@@ -51,7 +51,7 @@ class _PylonNodes:
             return action(self._nodes.GetNode(name))
         except self._genicam.GenericException as error:
             raise InstrumentError(
-                f"{self._who}: feature {name}: {_said(error)}; check that the camera is there and has it"
+                f"{self._who}: feature {name}: {_message_of(error)}; check that the camera is there and has it"
             ) from error
 
     def has(self, name: str) -> bool:
@@ -101,11 +101,15 @@ class BaslerCamera(GenicamCamera):
             self._camera = pylon.InstantCamera(factory.CreateDevice(info))
             self._camera.Open()
         except genicam.GenericException as error:
-            said = _said(error)
+            message = _message_of(error)
             kind = (
-                InUse if "controlled by another application" in said or "exclusively opened" in said else Disconnected
+                InUse
+                if "controlled by another application" in message or "exclusively opened" in message
+                else Disconnected
             )
-            raise kind(f"camera {self.address}: can't be opened ({said}); close other programs that use it") from error
+            raise kind(
+                f"camera {self.address}: can't be opened ({message}); close other programs that use it"
+            ) from error
         firmware = info.GetDeviceVersion() if info.IsDeviceVersionAvailable() else ""
         identity = Identity(info.GetVendorName(), info.GetModelName(), info.GetSerialNumber(), firmware)
         nodes = _PylonNodes(self._camera.GetNodeMap(), f"camera {self.address}")
@@ -158,7 +162,9 @@ class BaslerCamera(GenicamCamera):
         try:
             return action()
         except genicam.GenericException as error:
-            raise Disconnected(f"{self._who}: {_said(error)}; plug it in again, the next call reconnects") from error
+            raise Disconnected(
+                f"{self._who}: {_message_of(error)}; plug it in again, the next call reconnects"
+            ) from error
 
     def _release(self) -> None:
         camera, self._camera = self._camera, None

@@ -14,8 +14,8 @@ class RememberedFeatures:
     """The features of a camera; `found` keeps what each was set to, by `Name` or, where a selector chooses,
     `Name[Entry]`."""
 
-    def __init__(self, features: CameraFeatures, found: FoundSettings) -> None:
-        self._features, self._found = features, found
+    def __init__(self, features: CameraFeatures, kept: FoundSettings) -> None:
+        self._features, self._found = features, kept
 
     def has(self, name: str) -> bool:
         return self._features.has(name)

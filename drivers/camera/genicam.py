@@ -177,7 +177,7 @@ class GenicamCamera(StreamingCamera):
         set_if_there(features, "TriggerSelector", "FrameStart")
         if not features.has("TriggerMode"):
             raise InstrumentError(
-                f"{self._who}: it has no TriggerMode, so that it can't be told when to expose; use a camera that can "
+                f"{self._who}: it has no TriggerMode, so that its exposures can't be triggered; use a camera whose can "
                 "be triggered"
             )
         features.set("TriggerMode", "On")
@@ -212,7 +212,7 @@ class GenicamCamera(StreamingCamera):
 
     def departures(self) -> tuple[str, ...]:
         with self._used():
-            return tuple(f"{told}: its codes aren't the converter's" for told in self._departures)
+            return tuple(f"{departure}: its codes aren't the converter's" for departure in self._departures)
 
     def sensor(self) -> SensorInfo:
         with self._used() as features:

@@ -1,4 +1,4 @@
-"""What every GenICam camera is told before it may measure: nothing automatic, nothing that bends its codes, and which
+"""Settings of every GenICam camera before it may measure: nothing automatic, nothing that changes its codes, and which
 lines trigger.
 
 The names are those of EMVA's Standard Features Naming Convention (SFNC 2.7), and makers' own where they differ. The
@@ -52,19 +52,19 @@ class AskedFeatures:
         return bool(self._ask("has", name))
 
     def get(self, name: str) -> Setting:
-        found: Setting = self._ask("get", name)
-        return found
+        setting: Setting = self._ask("get", name)
+        return setting
 
     def set(self, name: str, value: Setting) -> None:
         self._ask("set", name, value)
 
     def entries(self, name: str) -> Collection[str]:
-        found: Collection[str] = self._ask("entries", name)
-        return found
+        entries: Collection[str] = self._ask("entries", name)
+        return entries
 
     def limits(self, name: str) -> tuple[float, float]:
-        found: tuple[float, float] = self._ask("limits", name)
-        return found
+        limits: tuple[float, float] = self._ask("limits", name)
+        return limits
 
     def execute(self, name: str) -> None:
         self._ask("execute", name)
@@ -77,7 +77,7 @@ class Neutral:
     `selector`: the feature that chooses which of several is meant; all of its entries are set, or those that begin as
     one of `entries`. `switch`: features that switch it off: where the camera has one, its own value doesn't matter.
     `must`: a camera on which it stays on is refused, as its frames can't be compared, or aren't proportional to light;
-    otherwise that is told, and belongs to its frames."""
+    otherwise that is reported, and stored with its frames."""
 
     name: str
     value: Setting
@@ -158,7 +158,7 @@ NEUTRAL: tuple[Neutral, ...] = (
 )
 
 #: Features whose value depends on a selector's.
-SELECTORS = {one.name: one.selector for one in NEUTRAL if one.selector} | {
+SELECTORS = {neutral.name: neutral.selector for neutral in NEUTRAL if neutral.selector} | {
     "BlackLevel": "BlackLevelSelector",
     "TriggerMode": "TriggerSelector",
     "TriggerSource": "TriggerSelector",
@@ -230,41 +230,47 @@ def make_neutral(features: Features, who: str) -> tuple[str, ...]:
     Raises `InstrumentError` that names what stays on and must not: codes of such a camera aren't proportional to light.
     """
     stays: list[str] = []
-    for one in NEUTRAL:
-        if not _is_offered(features, one) or any(features.has(switch) for switch in one.switch):
+    for neutral in NEUTRAL:
+        if not _is_offered(features, neutral) or any(features.has(switch) for switch in neutral.switch):
             continue
-        for where in _places(features, one):
-            refused = _neutralised(features, one)
-            found = features.get(one.name)
-            if _is_neutral(found, one.value):
+        for where in _places(features, neutral):
+            refused = _neutralise(features, neutral)
+            setting = features.get(neutral.name)
+            if _is_neutral(setting, neutral.value):
                 continue
-            if one.must:
+            if neutral.must:
                 raise InstrumentError(
-                    f"{who}: {one.name} is {found} and can't be set to {one.value}: its codes aren't the converter's; "
-                    "switch it off with the maker's program and save that as the camera's default"
+                    f"{who}: {neutral.name} is {setting} and can't be set to {neutral.value}: its codes aren't the "
+                    "converter's; switch it off with the maker's program and save that as the camera's default"
                 ) from refused
-            stays.append(f"{one.name}{where} = {found}")
+            stays.append(f"{neutral.name}{where} = {setting}")
     return tuple(stays)
 
 
-def _is_offered(features: Features, one: Neutral) -> bool:
-    return features.has(one.name) and not (isinstance(one.value, str) and one.value not in features.entries(one.name))
+def _is_offered(features: Features, neutral: Neutral) -> bool:
+    return features.has(neutral.name) and not (
+        isinstance(neutral.value, str) and neutral.value not in features.entries(neutral.name)
+    )
 
 
-def _places(features: Features, one: Neutral) -> Iterator[str]:
+def _places(features: Features, neutral: Neutral) -> Iterator[str]:
     """Each entry of the selector in turn, selected, as `[Entry]`; nothing where there is no selector. The one that was
     selected is so again."""
-    if not one.selector or not features.has(one.selector):
-        if one.entries == ("",):
+    if not neutral.selector or not features.has(neutral.selector):
+        if neutral.entries == ("",):
             yield ""
         return
-    selected = features.get(one.selector)
+    selected = features.get(neutral.selector)
     try:
-        for entry in features.entries(one.selector):
-            if entry.startswith(one.entries) and _selects(features, one.selector, entry) and features.has(one.name):
+        for entry in features.entries(neutral.selector):
+            if (
+                entry.startswith(neutral.entries)
+                and _selects(features, neutral.selector, entry)
+                and features.has(neutral.name)
+            ):
                 yield f"[{entry}]"
     finally:
-        _selects(features, one.selector, str(selected))
+        _selects(features, neutral.selector, str(selected))
 
 
 def _selects(features: Features, selector: str, entry: str) -> bool:
@@ -280,12 +286,12 @@ def _selects(features: Features, selector: str, entry: str) -> bool:
     return True
 
 
-def _neutralised(features: Features, one: Neutral) -> InstrumentError | None:
+def _neutralise(features: Features, neutral: Neutral) -> InstrumentError | None:
     """Set the feature unless it is neutral; why that failed."""
-    if _is_neutral(features.get(one.name), one.value):
+    if _is_neutral(features.get(neutral.name), neutral.value):
         return None
     try:
-        features.set(one.name, one.value)
+        features.set(neutral.name, neutral.value)
     except (NoAnswer, Disconnected):
         raise
     except InstrumentError as error:
@@ -293,29 +299,29 @@ def _neutralised(features: Features, one: Neutral) -> InstrumentError | None:
     return None
 
 
-def _is_neutral(found: Setting, neutral: Setting) -> bool:
+def _is_neutral(setting: Setting, neutral: Setting) -> bool:
     """Return whether a value is the neutral one, but for a register's rounding: a thousandth."""
-    if isinstance(neutral, float) and isinstance(found, int | float):
-        return abs(found - neutral) <= 1e-3
-    return found == neutral
+    if isinstance(neutral, float) and isinstance(setting, int | float):
+        return abs(setting - neutral) <= 1e-3
+    return setting == neutral
 
 
 def snapshot(features: Features) -> dict[str, Setting]:
     """All settings that bear on a frame, as the camera reports them; those that it can't tell now are left out."""
-    found: dict[str, Setting] = {}
+    settings: dict[str, Setting] = {}
     for name in (*RECORDED, "Gain"):
-        _note(features, name, name, found)
-    for one in NEUTRAL:
-        if features.has(one.name):
-            for where in _places(features, one):
-                _note(features, one.name, f"{one.name}{where}", found)
-    return found
+        _note(features, name, name, settings)
+    for neutral in NEUTRAL:
+        if features.has(neutral.name):
+            for where in _places(features, neutral):
+                _note(features, neutral.name, f"{neutral.name}{where}", settings)
+    return settings
 
 
-def _note(features: Features, name: str, key: str, found: dict[str, Setting]) -> None:
+def _note(features: Features, name: str, key: str, settings: dict[str, Setting]) -> None:
     try:
         if features.has(name):
-            found[key] = features.get(name)
+            settings[key] = features.get(name)
     except (NoAnswer, Disconnected):
         raise
     except InstrumentError:

@@ -92,13 +92,13 @@ class _Producer:
 
     def cameras(self) -> list[tuple[str, str]]:
         """(address, what it is) of each."""
-        with self._open() as found:
+        with self._open() as open_cameras:
             return [
                 (
-                    _told(one, "serial_number") or one.id_,
-                    " ".join(filter(None, (_told(one, name) for name in ("vendor", "model", "serial_number")))),
+                    _told(camera, "serial_number") or camera.id_,
+                    " ".join(filter(None, (_told(camera, name) for name in ("vendor", "model", "serial_number")))),
                 )
-                for one in found
+                for camera in open_cameras
             ]
 
     def take(self, address: str, description: str | None) -> Any:
@@ -112,15 +112,15 @@ class _Producer:
         }
         if description is not None:
             asked[key.REMOTE_DEVICE_SOURCE_XML_FILE_PATH] = description
-        with self._open() as found:
-            for one in found:
-                if address in (_told(one, name) for name in ("serial_number", "id_", "user_defined_name")):
-                    acquirer = self._opened(one, core.ParameterSet(asked))
+        with self._open() as open_cameras:
+            for camera in open_cameras:
+                if address in (_told(camera, name) for name in ("serial_number", "id_", "user_defined_name")):
+                    acquirer = self._open_camera(camera, core.ParameterSet(asked))
                     self._taken += 1
                     return acquirer
         return None
 
-    def _opened(self, camera: Any, config: Any) -> Any:
+    def _open_camera(self, camera: Any, config: Any) -> Any:
         """Return the library opens a camera, and leaves it open where what follows fails: close it then."""
         made: list[Any] = []
 
@@ -168,8 +168,8 @@ def _producers(file: str | None) -> list[_Producer]:
     """That of a file, or all that are installed."""
     if file is not None:
         return [_Producer.of(Path(file).expanduser())]
-    folders = [Path(one) for one in os.environ.get(SEARCH_PATH, "").split(os.pathsep) if one]
-    return [_Producer.of(found) for folder in folders for found in sorted(folder.glob("*.cti"))]
+    folders = [Path(folder) for folder in os.environ.get(SEARCH_PATH, "").split(os.pathsep) if folder]
+    return [_Producer.of(file) for folder in folders for file in sorted(folder.glob("*.cti"))]
 
 
 class GentlCamera(GenicamCamera):
@@ -213,7 +213,7 @@ class GentlCamera(GenicamCamera):
                 f"in {SEARCH_PATH}, or "
                 "name its .cti file as producer in the station file"
             )
-        self._acquirer = next((found for found in map(self._take_from, producers) if found is not None), None)
+        self._acquirer = next((acquirer for acquirer in map(self._take_from, producers) if acquirer is not None), None)
         if self._acquirer is None:
             there = ", ".join(address for producer in producers for address, _ in producer.cameras()) or "none"
             raise Disconnected(
@@ -223,11 +223,14 @@ class GentlCamera(GenicamCamera):
         note.emit = self._note_incomplete
         self._acquirer.add_callback(self._acquirer.Events.INCOMPLETE_BUFFER, note)
         nodes = GenApiFeatures(self._acquirer.remote_device.node_map, f"camera {self.address}")
-        told = self._acquirer.device
+        device = self._acquirer.device
         versions = (name for name in ("DeviceFirmwareVersion", "DeviceVersion") if nodes.has(name))
         firmware = next((str(nodes.get(name)) for name in versions), "")
         return nodes, Identity(
-            _told(told, "vendor") or "", _told(told, "model") or "", _told(told, "serial_number") or told.id_, firmware
+            _told(device, "vendor") or "",
+            _told(device, "model") or "",
+            _told(device, "serial_number") or device.id_,
+            firmware,
         )
 
     def _take_from(self, producer: _Producer) -> Any:
@@ -256,7 +259,7 @@ class GentlCamera(GenicamCamera):
         until = time.monotonic() + timeout_s
         while True:
             self._incomplete = False
-            grabbed = self._do("reading a frame", self._asked)
+            grabbed = self._do("reading a frame", self._fetch)
             if grabbed is not None:
                 return grabbed
             if self._incomplete:
@@ -265,11 +268,11 @@ class GentlCamera(GenicamCamera):
                 return None
             time.sleep(_REST_S)
 
-    def _asked(self) -> Grabbed | None:
+    def _fetch(self) -> Grabbed | None:
         buffer = self._acquirer.try_fetch(timeout=_ASK_S, is_raw=True)
-        return None if buffer is None else self._grabbed(buffer)
+        return None if buffer is None else self._copy_buffer(buffer)
 
-    def _grabbed(self, buffer: Any) -> Grabbed:
+    def _copy_buffer(self, buffer: Any) -> Grabbed:
         """Its memory is the library's own: it is filled again once it is given back."""
         from genicam import gentl
 

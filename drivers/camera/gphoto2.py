@@ -35,12 +35,19 @@ _EVENT_MS = 20
 
 
 def seconds(choice: str) -> float | None:
-    """Return the exposure time (s) that a choice means: `1/60`, `0.0100s`, `2.5`, `30"`; None for `Bulb`, `Auto` and
-    so on."""
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)(?:/(\d+(?:\.\d+)?))?\s*(?:s|sec|\")?", choice.strip())
-    if found is None:
+    """Read the exposure time that a choice of the camera means.
+
+    choice : `1/60`, `0.0100s`, `2.5`, `30"`
+
+    Returns s; None for `Bulb`, `Auto` and so on.
+
+    >>> seconds("1/50"), seconds("2.5"), seconds("Bulb")
+    (0.02, 2.5, None)
+    """
+    fraction = re.fullmatch(r"(\d+(?:\.\d+)?)(?:/(\d+(?:\.\d+)?))?\s*(?:s|sec|\")?", choice.strip())
+    if fraction is None:
         return None
-    value = float(Fraction(found[1]) / Fraction(found[2] or 1)) if float(found[2] or 1) else 0.0
+    value = float(Fraction(fraction[1]) / Fraction(fraction[2] or 1)) if float(fraction[2] or 1) else 0.0
     return value or None
 
 
@@ -52,8 +59,8 @@ class Library:
 
         self._library = gphoto2
         self._camera: Any = None
-        found = list(gphoto2.Camera.autodetect())
-        ports = [port for _, port in found]
+        cameras = list(gphoto2.Camera.autodetect())
+        ports = [port for _, port in cameras]
         wanted = [address] if address.startswith(("usb:", "ptpip:")) else ports
         for port in wanted:
             camera = gphoto2.Camera()
@@ -74,8 +81,8 @@ class Library:
                 return
             camera.exit()
             self._camera = None
-        told = ", ".join(f"{model} at {port}" for model, port in found) or "none"
-        raise Disconnected(f"gphoto2: no camera {address!r}; it finds {told}: plug it in and switch it on")
+        listed = ", ".join(f"{model} at {port}" for model, port in cameras) or "none"
+        raise Disconnected(f"gphoto2: no camera {address!r}; it finds {listed}: plug it in and switch it on")
 
     def identity(self) -> tuple[str, str, str, str]:
         """Maker, model, serial number, firmware."""
@@ -98,8 +105,8 @@ class Library:
         return True
 
     def get(self, name: str) -> Setting:
-        found: Setting = self._widget(name).get_value()
-        return found
+        setting: Setting = self._widget(name).get_value()
+        return setting
 
     def set(self, name: str, value: Setting) -> None:
         widget = self._widget(name)
@@ -118,18 +125,18 @@ class Library:
 
     def settings(self) -> dict[str, Setting]:
         """All settings, by name."""
-        found: dict[str, Setting] = {}
+        settings: dict[str, Setting] = {}
 
         def look(widget: Any) -> None:
             inner = list(widget.get_children())
             if not inner:
                 with suppress(self._library.GPhoto2Error):
-                    found[widget.get_name()] = widget.get_value()
-            for one in inner:
-                look(one)
+                    settings[widget.get_name()] = widget.get_value()
+            for child in inner:
+                look(child)
 
         look(self._camera.get_config())
-        return found
+        return settings
 
     def expose(self) -> None:
         """Trigger it; files of an exposure before that come now aren't this one's."""
@@ -139,13 +146,13 @@ class Library:
 
     def files(self) -> list[tuple[str, str]]:
         """Folder and name of what the camera wrote since it was asked last."""
-        library, found = self._library, []
+        library, files = self._library, []
         while True:
-            kind, told = self._camera.wait_for_event(_EVENT_MS)
+            kind, event = self._camera.wait_for_event(_EVENT_MS)
             if kind == library.GP_EVENT_FILE_ADDED:
-                found.append((told.folder, told.name))
+                files.append((event.folder, event.name))
             elif kind == library.GP_EVENT_TIMEOUT:
-                return found
+                return files
 
     def fetch(self, folder: str, name: str, wanted: bool) -> bytes:
         """Return a file's bytes where it is wanted; it is deleted on the camera: it was made for this."""
@@ -200,7 +207,11 @@ class Gphoto2Camera(LibraryCamera):
         format_name = next((name for name in _FORMATS if features.has(name)), None)
         if format_name is not None:
             choices = features.entries(format_name)
-            raw = [one for one in choices if "raw" in one.lower() and "+" not in one and "jpeg" not in one.lower()]
+            raw = [
+                choice
+                for choice in choices
+                if "raw" in choice.lower() and "+" not in choice and "jpeg" not in choice.lower()
+            ]
             chosen = self._image_format or next(iter(raw), None)
             if chosen is not None:
                 self._choose(features, format_name, chosen)
@@ -222,8 +233,8 @@ class Gphoto2Camera(LibraryCamera):
             raise InstrumentError(f"{self._who}: {name} can't be {value!r}; it has {', '.join(choices)}")
         if features.get(name) != value:
             features.set(name, value)
-            if (found := features.get(name)) != value:
-                raise InstrumentError(f"{self._who}: {name} stays {found!r}, and {value!r} is wanted; set it by hand")
+            if (setting := features.get(name)) != value:
+                raise InstrumentError(f"{self._who}: {name} stays {setting!r}, and {value!r} is wanted; set it by hand")
 
     def _sensor(self) -> SensorInfo:
         if self._sample is None:
@@ -248,7 +259,7 @@ class Gphoto2Camera(LibraryCamera):
         assert self._features is not None
         return self._features
 
-    def _checked(self, exposure_s: float, gain_db: float) -> float | None:
+    def _check_settings(self, exposure_s: float, gain_db: float) -> float | None:
         if not (math.isfinite(exposure_s) and exposure_s > 0 and math.isfinite(gain_db)):
             raise InstrumentError(f"{self._who}: exposure {exposure_s} s at {gain_db} dB; give a positive time")
         nearest = self._nearest(exposure_s)
@@ -273,7 +284,7 @@ class Gphoto2Camera(LibraryCamera):
         return min(self._times, key=lambda time_s: abs(math.log(time_s / exposure_s)))
 
     def _check_gain(self, unit: float) -> None:
-        """`_checked` has."""
+        """`_check_settings` has."""
 
     def _set(self, features: CameraFeatures, exposure_s: float, gain: float | None) -> float:
         nearest = self._nearest(exposure_s)
@@ -286,7 +297,7 @@ class Gphoto2Camera(LibraryCamera):
         self._files = []
         self.ask("expose")
 
-    def _exposed(self) -> bool:
+    def _has_exposed(self) -> bool:
         self._files += self.ask("files")
         return bool(self._files)
 
@@ -299,27 +310,27 @@ class Gphoto2Camera(LibraryCamera):
                 f"{self._who}: {len(raw)} pictures came for one trigger; switch bracketing and series off, and let the "
                 "camera write one raw file a picture"
             )
-        return read_raw(BytesIO(next(one for one in data if one)), raw[0][1], self._who)
+        return read_raw(BytesIO(next(content for content in data if content)), raw[0][1], self._who)
 
     def _read(self) -> NDArray[np.uint16]:
-        found, sample = self._picture(), self._sample
-        self._sample = sample = sample or found
-        if found.raw.shape != sample.raw.shape or found.cfa != sample.cfa:
+        picture, sample = self._picture(), self._sample
+        self._sample = sample = sample or picture
+        if picture.raw.shape != sample.raw.shape or picture.cfa != sample.cfa:
             raise Garbled(
-                f"{self._who}: a picture has {found.raw.shape} pixels of {found.cfa}, those before had "
+                f"{self._who}: a picture has {picture.raw.shape} pixels of {picture.cfa}, those before had "
                 f"{sample.raw.shape} of {sample.cfa}; keep the camera's picture size"
             )
         exposure_s = self._exposure_s or 0.0
-        if found.exposure_s and abs(found.exposure_s - exposure_s) > TOLERANCE * exposure_s:
+        if picture.exposure_s and abs(picture.exposure_s - exposure_s) > TOLERANCE * exposure_s:
             raise InstrumentError(
-                f"{self._who}: a picture was exposed for {found.exposure_s:g} s, and {exposure_s:g} s were asked for: "
-                "set the camera to manual (M)"
+                f"{self._who}: a picture was exposed for {picture.exposure_s:g} s, and {exposure_s:g} s were asked "
+                "for: set the camera to manual (M)"
             )
-        return found.raw
+        return picture.raw
 
     def _settings(self) -> dict[str, Setting]:
-        found: dict[str, Setting] = self.ask("settings")
-        return found
+        settings: dict[str, Setting] = self.ask("settings")
+        return settings
 
     def _abort(self) -> None:
-        """It can't be told to: what still comes is dropped before the next exposure."""
+        """It has no such command: files that still come are dropped before the next exposure."""

@@ -86,21 +86,21 @@ class IndiCamera(SingleFrameCamera):
         )
 
     def _set_numbers(self, features: CameraFeatures, name: str, **wanted: int) -> None:
-        if all(self._device.number(name, one) == value for one, value in wanted.items()):
+        if all(self._device.number(name, element) == value for element, value in wanted.items()):
             return
-        features.set(name, ";".join(f"{one}={value}" for one, value in wanted.items()))
-        for one, value in wanted.items():
-            if (found := self._device.number(name, one)) != value:
+        features.set(name, ";".join(f"{element}={value}" for element, value in wanted.items()))
+        for element, value in wanted.items():
+            if (number := self._device.number(name, element)) != value:
                 raise InstrumentError(
-                    f"{self._who}: {name} {one} stays {found:g}, and {value} is wanted; set it in its driver"
+                    f"{self._who}: {name} {element} stays {number:g}, and {value} is wanted; set it in its driver"
                 )
 
     def _colour_filters(self) -> str:
-        told = self._device.text("CCD_CFA", "CFA_TYPE")
-        if not told:
+        pattern = self._device.text("CCD_CFA", "CFA_TYPE")
+        if not pattern:
             return "MONO"
         shift_x, shift_y = (int(float(self._device.text("CCD_CFA", f"CFA_OFFSET_{axis}") or 0)) for axis in "XY")
-        return "".join(told[2 * ((row + shift_y) % 2) + (col + shift_x) % 2] for row in (0, 1) for col in (0, 1))
+        return "".join(pattern[2 * ((row + shift_y) % 2) + (col + shift_x) % 2] for row in (0, 1) for col in (0, 1))
 
     def _sensor(self) -> SensorInfo:
         assert self._info is not None
@@ -114,8 +114,10 @@ class IndiCamera(SingleFrameCamera):
     def _set(self, features: CameraFeatures, exposure_s: float, gain: float | None) -> float:
         if gain is not None:
             features.set("CCD_GAIN", f"GAIN={gain:g}")
-            if abs((found := self._device.number("CCD_GAIN", "GAIN")) - gain) > 1e-6:
-                raise InstrumentError(f"{self._who}: told a gain of {gain:g} it says {found:g}; ask for another")
+            if abs((set_gain := self._device.number("CCD_GAIN", "GAIN")) - gain) > 1e-6:
+                raise InstrumentError(
+                    f"{self._who}: a gain of {gain:g} was set and {set_gain:g} is read; ask for another"
+                )
         return exposure_s
 
     def _expose(self, exposure_s: float) -> None:
@@ -124,7 +126,7 @@ class IndiCamera(SingleFrameCamera):
             self._abort()
         self._device.begin(_EXPOSURE, f"CCD_EXPOSURE_VALUE={exposure_s!r}", picture=_PICTURE)
 
-    def _exposed(self) -> bool:
+    def _has_exposed(self) -> bool:
         if self._device.blob(_PICTURE, 0.02) is not None:
             return True
         if self._device.state(_EXPOSURE) == "Alert":
@@ -140,8 +142,8 @@ class IndiCamera(SingleFrameCamera):
             with fits.open(BytesIO(data), memmap=False) as file:
                 header, codes = file[0].header, np.array(file[0].data)
         except (OSError, ValueError, TypeError, IndexError) as error:
-            said = " ".join(str(error).split())
-            raise Garbled(f"{self._who}: a frame of {len(data)} bytes isn't FITS ({said}); ask again") from error
+            message = " ".join(str(error).split())
+            raise Garbled(f"{self._who}: a frame of {len(data)} bytes isn't FITS ({message}); ask again") from error
         info = self._sensor()
         if codes.shape != (info.rows, info.cols):
             raise Garbled(

@@ -79,8 +79,8 @@ class Core:
 
     def temperature_c(self) -> float | None:
         """Return the sensor's temperature, where the adapter tells."""
-        told = self._first(*_TEMPERATURE)
-        return float(told) if told else None
+        reading = self._first(*_TEMPERATURE)
+        return float(reading) if reading else None
 
     def has(self, name: str) -> bool:
         if name in (EXPOSURE_MS, REGION):
@@ -263,14 +263,14 @@ class MicroManagerCamera(LibraryCamera):
         found_s = 1e-3 * float(features.get(EXPOSURE_MS))
         if abs(found_s - exposure_s) > _TOLERANCE * exposure_s:
             raise InstrumentError(
-                f"{self._who}: told to expose for {exposure_s:g} s it says {found_s:g} s; ask for a time that it has"
+                f"{self._who}: an exposure of {exposure_s:g} s was set and {found_s:g} s is read; choose another"
             )
         return found_s
 
     def _expose(self, exposure_s: float) -> None:
         self.ask("expose")
 
-    def _exposed(self) -> bool:
+    def _has_exposed(self) -> bool:
         return bool(self.ask("exposed"))
 
     def _read(self) -> NDArray[np.uint16]:
@@ -286,8 +286,8 @@ class MicroManagerCamera(LibraryCamera):
         return picture.astype(np.uint16)
 
     def _temperature_c(self) -> float | None:
-        found: float | None = self.ask("temperature_c")
-        return found
+        temperature_c: float | None = self.ask("temperature_c")
+        return temperature_c
 
     def _settings(self) -> dict[str, Setting]:
         return dict(self.ask("properties"))
@@ -297,9 +297,9 @@ class MicroManagerCamera(LibraryCamera):
             raise InstrumentError(f"{self._who}: its shutter stays open; close it by hand")
 
 
-def _same(found: Setting, wanted: str) -> bool:
+def _same(setting: Setting, wanted: str) -> bool:
     """Return whether a number is written otherwise: `1` for `1.0000`."""
     try:
-        return math.isclose(float(found), float(wanted), rel_tol=1e-6)
+        return math.isclose(float(setting), float(wanted), rel_tol=1e-6)
     except ValueError:
         return False

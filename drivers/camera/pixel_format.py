@@ -64,15 +64,17 @@ def _formats() -> dict[int, PixelFormat]:
         12: {"BG": 0x010C0053, "GB": 0x010C0055, "GR": 0x010C0057, "RG": 0x010C0059},
     }
     mono = {8: 0x01080001, 10: 0x01100003, 12: 0x01100005, 14: 0x01100025, 16: 0x01100007}
-    found = [PixelFormat(f"Mono{bits}", code, "MONO", bits, False) for bits, code in mono.items()]
-    found += [
+    formats = [PixelFormat(f"Mono{bits}", code, "MONO", bits, False) for bits, code in mono.items()]
+    formats += [
         PixelFormat("Mono10p", 0x010A0046, "MONO", 10, True),
         PixelFormat("Mono12p", 0x010C0047, "MONO", 12, True),
     ]
     for index, (short, cfa) in enumerate(phases.items()):
-        found += [PixelFormat(f"Bayer{short}{bits}", code + index, cfa, bits, False) for bits, code in first.items()]
-        found += [PixelFormat(f"Bayer{short}{bits}p", codes[short], cfa, bits, True) for bits, codes in packed.items()]
-    return {item.code: item for item in found}
+        formats += [PixelFormat(f"Bayer{short}{bits}", code + index, cfa, bits, False) for bits, code in first.items()]
+        formats += [
+            PixelFormat(f"Bayer{short}{bits}p", codes[short], cfa, bits, True) for bits, codes in packed.items()
+        ]
+    return {item.code: item for item in formats}
 
 
 PIXEL_FORMATS = _formats()

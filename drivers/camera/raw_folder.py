@@ -151,17 +151,17 @@ class RawFolderCamera(Camera):
         with self._lock:
             if self._seen is None or self._exposure_s is None or self._fired is None:
                 raise InstrumentError(f"{self._who}: no frame was asked for; call arm and fire first")
-            seen, self._seen = self._seen, None
-            file = self._await_file(seen, self._exposure_s)
+            known, self._seen = self._seen, None
+            file = self._await_file(known, self._exposure_s)
             self._record("received", file.name.encode())
-            found, sample = read_raw(file, file.name, self._who), self._ready()
-            if found.raw.shape != sample.raw.shape or found.cfa != sample.cfa:
+            picture, sample = read_raw(file, file.name, self._who), self._ready()
+            if picture.raw.shape != sample.raw.shape or picture.cfa != sample.cfa:
                 raise Garbled(
-                    f"{self._who}: {file.name} has {found.raw.shape} pixels of {found.cfa}, the files before had "
+                    f"{self._who}: {file.name} has {picture.raw.shape} pixels of {picture.cfa}, the files before had "
                     f"{sample.raw.shape} of "
                     f"{sample.cfa}; keep the camera's picture size"
                 )
-            exposure_s = found.exposure_s or self._exposure_s
+            exposure_s = picture.exposure_s or self._exposure_s
             if abs(exposure_s - self._exposure_s) > TOLERANCE * self._exposure_s:
                 raise InstrumentError(
                     f"{self._who}: {file.name} was exposed for {exposure_s:g} s, and {self._exposure_s:g} s were "
@@ -169,7 +169,7 @@ class RawFolderCamera(Camera):
                     "to manual and to that time"
                 )
             self._frames += 1
-            return Frame(found.raw, exposure_s, self._gain_db, None, self._fired, "raw file", self._frames - 1)
+            return Frame(picture.raw, exposure_s, self._gain_db, None, self._fired, "raw file", self._frames - 1)
 
     def capture(self) -> Frame:
         """One frame on a software trigger; of two threads the second waits."""
@@ -218,18 +218,18 @@ class RawFolderCamera(Camera):
                 f"{self._who}: {words[0]} can't be run ({error.strerror}); correct the command in the station file"
             ) from error
         if done.returncode:
-            said = " ".join((done.stderr or done.stdout).split())[-160:]
+            message = " ".join((done.stderr or done.stdout).split())[-160:]
             raise InstrumentError(
-                f"{self._who}: {words[0]} failed with code {done.returncode} ({said}); try it by hand"
+                f"{self._who}: {words[0]} failed with code {done.returncode} ({message}); try it by hand"
             )
 
-    def _await_file(self, seen: frozenset[Path], exposure_s: float) -> Path:
+    def _await_file(self, known: frozenset[Path], exposure_s: float) -> Path:
         """Return the file that wasn't there before, once it is complete. Raises `NoAnswer`, `Interrupted`, `Garbled`
         for two."""
         until = time.monotonic() + exposure_s + self.timeout_s
         size, since = -1, time.monotonic()
         while True:
-            new = sorted(self._files() - seen)
+            new = sorted(self._files() - known)
             if len(new) > 1:
                 raise Garbled(
                     f"{self._who}: {len(new)} files came for one trigger ({', '.join(file.name for file in new[:3])}); "

@@ -1,4 +1,4 @@
-"""What cameras have in common that are told to expose once and asked for the picture: Micro-Manager's, ASCOM's, INDI's,
+"""Cameras that expose once on a command, and whose picture is then fetched: Micro-Manager's, ASCOM's, INDI's,
 gphoto2's.
 
 What reaches the camera says how each step is done. In which order, until when, and what is restored is here.
@@ -103,7 +103,7 @@ class SingleFrameCamera(Camera):
         """Begin an exposure and return."""
 
     @abstractmethod
-    def _exposed(self) -> bool:
+    def _has_exposed(self) -> bool:
         """Return whether the picture is there."""
 
     @abstractmethod
@@ -152,7 +152,7 @@ class SingleFrameCamera(Camera):
 
     def check(self, exposure_s: float, gain_db: float = 0.0) -> None:
         with self._used():
-            self._checked(exposure_s, gain_db)
+            self._check_settings(exposure_s, gain_db)
 
     def check_trigger(self, trigger: Trigger) -> None:
         if trigger == "line" and self._wanted_line is None:
@@ -162,10 +162,10 @@ class SingleFrameCamera(Camera):
 
     def configure(self, exposure_s: float, gain_db: float = 0.0) -> None:
         with self._used() as features:
-            gain = self._checked(exposure_s, gain_db)
+            gain = self._check_settings(exposure_s, gain_db)
             self._exposure_s, self._gain_db = self._set(features, exposure_s, gain), gain_db
 
-    def _checked(self, exposure_s: float, gain_db: float) -> float | None:
+    def _check_settings(self, exposure_s: float, gain_db: float) -> float | None:
         """Return the gain in its own unit; None: as it is. Raises `InstrumentError` for what it can't do."""
         if not (math.isfinite(exposure_s) and exposure_s > 0 and math.isfinite(gain_db)):
             raise InstrumentError(f"{self._who}: exposure {exposure_s} s at {gain_db} dB; give a positive time")
@@ -238,7 +238,7 @@ class SingleFrameCamera(Camera):
 
     def _await_exposed(self, exposure_s: float) -> None:
         until = time.monotonic() + exposure_s + self._timeout_s
-        while not self._exposed():
+        while not self._has_exposed():
             if time.monotonic() > until:
                 raise NoAnswer(
                     f"{self._who}: no frame within {self._timeout_s:g} s of its exposure of {exposure_s:g} s; check "

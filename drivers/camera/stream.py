@@ -24,9 +24,12 @@ _LAST_OF_16_BIT = 0xFFFF
 
 
 def frames_between(before: int, now: int) -> int:
-    """Return how many frames were numbered between two; below 0 for one that comes out of order.
+    """Count the frames that were numbered between two; below 0 for one that comes out of order.
 
-    GigE Vision's 16-bit numbers go from 65535 to 1; a camera that doesn't count says 0.
+    before, now : frame numbers. GigE Vision's 16-bit numbers go from 65535 to 1; a camera that doesn't count says 0
+
+    >>> frames_between(3, 4), frames_between(65535, 1), frames_between(4, 3)
+    (0, 0, -2)
     """
     if before == now == 0:
         return 0
@@ -47,7 +50,7 @@ class _Side:
     frame: Frame | None = field(default=None, repr=False)  # of `trigger`; None: taken, or torn
 
     def since_ns(self) -> int | None:
-        """Time on its own clock from the pair before to its frame; None where the clock isn't told."""
+        """Time on its own clock from the pair before to its frame; None where the camera doesn't report it."""
         if self.frame is None or self.frame.camera_time_ns is None or self.matched_ns is None:
             return None
         return self.frame.camera_time_ns - self.matched_ns
@@ -175,7 +178,7 @@ class FrameStream:
         for side in self._sides:
             while side.trigger < self._settled:
                 self._receive(side)
-        late = self._missed()
+        late = self._find_missed()
         if late is not None:
             self._count_on(late, 1, f"{late.name}: it didn't hear a trigger; use a longer interval, and check its line")
         newest = max(side.trigger for side in self._sides)
@@ -228,7 +231,7 @@ class FrameStream:
             self._settled += 1
             self._given.popleft()
 
-    def _missed(self) -> _Side | None:
+    def _find_missed(self) -> _Side | None:
         """Return a wired camera whose frame began half an interval later than the others': it belongs to another
         trigger.
 
@@ -242,7 +245,7 @@ class FrameStream:
         if len(since) < 2:
             return None
         least_ns = min(since_ns for since_ns, _ in since)
-        most_ns, late = max(since, key=lambda one: one[0])
+        most_ns, late = max(since, key=lambda interval_and_side: interval_and_side[0])
         interval_ns = 1e9 * self._interval_s or least_ns
         return late if most_ns - least_ns > 0.5 * interval_ns else None
 

@@ -73,7 +73,7 @@ _WAIT_S = 1.0
 
 @dataclass(frozen=True)
 class StreamLayout:
-    """The transfers of one frame (bytes), as the stream's registers (SIRM) were told."""
+    """The transfers of one frame (bytes), as the stream's registers (SIRM) were set."""
 
     leader_bytes: int
     trailer_bytes: int
@@ -274,11 +274,11 @@ class _Interfaces:
 
     @classmethod
     def of(cls, device: usb.core.Device, who: str) -> _Interfaces:
-        found: dict[int, usb.core.Interface] = {}
+        interfaces: dict[int, usb.core.Interface] = {}
         for interface in device.get_active_configuration():
             if (interface.bInterfaceClass, interface.bInterfaceSubClass) == (0xEF, 0x05):
-                found.setdefault(interface.bInterfaceProtocol, interface)
-        if 0 not in found or 2 not in found:
+                interfaces.setdefault(interface.bInterfaceProtocol, interface)
+        if 0 not in interfaces or 2 not in interfaces:
             raise InstrumentError(
                 f"{who}: this USB device is no USB3 Vision camera with a stream; correct the address in the station "
                 "file"
@@ -290,7 +290,7 @@ class _Interfaces:
                     return int(item.bEndpointAddress)
             raise InstrumentError(f"{who}: interface {interface.bInterfaceNumber} lacks a bulk endpoint")
 
-        control, stream = found[0], found[2]
+        control, stream = interfaces[0], interfaces[2]
         return cls(
             control.bInterfaceNumber,
             stream.bInterfaceNumber,
@@ -421,12 +421,12 @@ class U3vCamera(GenicamCamera):
         try:
             return self._stream.get(timeout_s)
         except usb.core.USBError as error:
-            told = translate(error, self._who, f"reading a frame of {self._exposure_s:g} s")
-            if isinstance(told, NoAnswer):  # a halted endpoint: the next start clears it
+            failure = translate(error, self._who, f"reading a frame of {self._exposure_s:g} s")
+            if isinstance(failure, NoAnswer):  # a halted endpoint: the next start clears it
                 self.disarm()
-                raise NoFrame(str(told)) from error
+                raise NoFrame(str(failure)) from error
             self._drop()
-            raise told from error
+            raise failure from error
 
     def _halt(self) -> None:
         """Stop, and discard what is still in the pipe."""

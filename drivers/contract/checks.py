@@ -65,7 +65,7 @@ def check_driver(family: str, name: str, peer: Peer) -> Iterator[Outcome]:
     subject = _Subject(family, name, peer)
     for asks, check in _CHECKS.items():
         try:
-            _bounded(lambda check=check: check(subject), 4 * LIMIT_S)  # type: ignore[misc]
+            _run_bounded(lambda check=check: check(subject), 4 * LIMIT_S)  # type: ignore[misc]
         except _LeftOut as reason:
             yield Outcome(asks, "left out", str(reason))
         except NotMet as found:
@@ -74,9 +74,6 @@ def check_driver(family: str, name: str, peer: Peer) -> Iterator[Outcome]:
             yield Outcome(asks, "not met", f"{type(error).__name__}: {' '.join(str(error).split())}")
         else:
             yield Outcome(asks, "met")
-
-
-# --- the checks -------------------------------------------------------------------------------------------------------
 
 
 def _identify(subject: _Subject) -> None:
@@ -168,7 +165,7 @@ def _stop_in_the_middle(subject: _Subject, driver: Instrument) -> None:
     worker.join(_UNDER_WAY_S)
     require(worker.is_alive(), f"the long call ended within {_UNDER_WAY_S} s: the peer isn't slow")
     began = time.monotonic()
-    _bounded(driver.stop, LIMIT_S)
+    _run_bounded(driver.stop, LIMIT_S)
     worker.join(LIMIT_S)
     require(not worker.is_alive(), "the call under way didn't end")
     require(
@@ -215,10 +212,7 @@ _CHECKS: dict[str, Callable[[_Subject], None]] = {
 }
 
 
-# --- how calls end ----------------------------------------------------------------------------------------------------
-
-
-def _bounded(call: Callable[[], object], limit_s: float) -> None:
+def _run_bounded(call: Callable[[], object], limit_s: float) -> None:
     """Run a call in a thread of its own; raise what it raised, or `NotMet` if it doesn't end."""
     raised: list[BaseException] = []
 
@@ -238,7 +232,7 @@ def _bounded(call: Callable[[], object], limit_s: float) -> None:
 
 def _fails_in_one_line(call: Callable[[], object], what: str) -> None:
     try:
-        _bounded(call, LIMIT_S)
+        _run_bounded(call, LIMIT_S)
     except InstrumentError as error:
         require("\n" not in str(error), f"{what}: the message has several lines")
         return
@@ -249,7 +243,7 @@ def _works_again(call: Callable[[], object], after: str) -> None:
     until = time.monotonic() + LIMIT_S
     while True:
         try:
-            _bounded(call, LIMIT_S)
+            _run_bounded(call, LIMIT_S)
         except InstrumentError as error:
             require(time.monotonic() < until, f"it doesn't work {LIMIT_S:g} s after {after}: {error}")
             time.sleep(0.05)

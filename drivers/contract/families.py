@@ -81,18 +81,18 @@ class MonochromatorContract(FamilyContract):
         for wavelength_nm in (450.0, 632.8, 0.0):
             driver.check_nm(wavelength_nm)  # refuses nothing that it can do
             driver.move_nm(wavelength_nm)
-            found = driver.wavelength_nm()
-            require(abs(found - wavelength_nm) <= 0.5, f"told to go to {wavelength_nm} nm it stands at {found} nm")
+            reached_nm = driver.wavelength_nm()
+            require(abs(reached_nm - wavelength_nm) <= 0.5, f"set to {wavelength_nm} nm it is at {reached_nm} nm")
         for wrong_nm in (-1.0, 1e6, math.nan, math.inf):
             require_refused(lambda wrong_nm=wrong_nm: driver.move_nm(wrong_nm), f"{wrong_nm} nm")  # type: ignore[misc]
         require(driver.wavelength_nm() <= 0.5, "a refused wavelength moved it")
         for opened in (False, True, False):
             (driver.open_shutter if opened else driver.close_shutter)()
-            require(driver.shutter_is_open() is opened, f"the shutter told to be open = {opened} isn't")
+            require(driver.shutter_is_open() is opened, f"the shutter was set to open = {opened} and isn't")
         before = driver.slit_um()
         driver.check_slit_um(500.0)
         driver.set_slit_um(500.0)
-        require(abs(driver.slit_um() - 500.0) <= 5.0, f"told a slit of 500 um it has {driver.slit_um()} um")
+        require(abs(driver.slit_um() - 500.0) <= 5.0, f"a slit of 500 um was set and {driver.slit_um()} um is read")
         require(driver.bandwidth_nm() > 0.0, "its bandwidth isn't above 0")
         driver.set_slit_um(before)
         for wrong_um in (-1.0, 1e9):
@@ -108,12 +108,12 @@ class SpectroradiometerContract(FamilyContract):
     kind = Spectroradiometer
 
     def everyday(self, driver: Spectroradiometer) -> None:
-        found = driver.measure()
-        wavelength_nm, value = found.radiance_w_sr_m2_nm.arrays
+        measurement = driver.measure()
+        wavelength_nm, value = measurement.radiance_w_sr_m2_nm.arrays
         require(wavelength_nm.size >= 2 and bool(np.all(np.diff(wavelength_nm) > 0)), "its wavelengths don't ascend")
         require(bool(np.all(np.isfinite(value))) and float(np.max(value)) > 0, "its spectrum isn't finite and above 0")
         require(100.0 < wavelength_nm[0] < wavelength_nm[-1] < 3000.0, "its wavelengths aren't in nm")
-        time_s = found.integration_time_s
+        time_s = measurement.integration_time_s
         require(time_s is None or 0.0 < time_s < 3600.0, f"its integration time is {time_s} s")
 
     def takes_long(self, driver: Spectroradiometer) -> None:
@@ -169,7 +169,7 @@ class CameraContract(FamilyContract):
             frame = driver.capture()
             require(
                 abs(frame.exposure_s - exposure_s) <= 0.1 * exposure_s,
-                f"told {exposure_s} s the frame says {frame.exposure_s} s",
+                f"an exposure of {exposure_s} s was set and the frame states {frame.exposure_s} s",
             )
         before = driver.capture().frame_id
         require(driver.capture().frame_id == before + 1, "the frames' numbers don't go up by 1")
@@ -207,7 +207,7 @@ class StageContract(FamilyContract):
     def settings(self, driver: Stage) -> None:
         for name in self._targets(driver)[:3]:
             driver.place(name)
-            require(driver.placed() == name, f"told to place {name} it says {driver.placed()!r}")
+            require(driver.placed() == name, f"{name} was asked for and {driver.placed()!r} is read")
         if driver.targets():
             require_refused(lambda: driver.place("no-such-target"), "a target that isn't there")
 
@@ -244,9 +244,9 @@ class PhotodiodeContract(FamilyContract):
         driver.measure_dark()
 
     def settings(self, driver: Photodiode) -> None:
-        found = driver.measure(550.0)
-        require(math.isfinite(found.irradiance_w_m2), f"its irradiance is {found.irradiance_w_m2} W/m2")
-        require(found.sd_irradiance_w_m2 > 0.0, "its irradiance has no uncertainty")
+        irradiance = driver.measure(550.0)
+        require(math.isfinite(irradiance.irradiance_w_m2), f"its irradiance is {irradiance.irradiance_w_m2} W/m2")
+        require(irradiance.sd_irradiance_w_m2 > 0.0, "its irradiance has no uncertainty")
         for wrong_nm in (-1.0, 1e6, math.nan):
             require_refused(lambda wrong_nm=wrong_nm: driver.measure(wrong_nm), f"{wrong_nm} nm")  # type: ignore[misc]
 
@@ -266,8 +266,8 @@ class LightSourceContract(FamilyContract):
         for channel in driver.channels():
             for level in (1.0, 0.5, 0.0):
                 driver.set_level(level, channel)
-                found = driver.level(channel)
-                require(abs(found - level) <= 0.05, f"told to be lit at {level} it says {found}")
+                read_level = driver.level(channel)
+                require(abs(read_level - level) <= 0.05, f"a level of {level} was set and {read_level} is read")
         for wrong in (-0.1, 1.1, math.nan):
             require_refused(lambda wrong=wrong: driver.set_level(wrong), f"a level of {wrong}")  # type: ignore[misc]
         require_refused(lambda: driver.set_level(0.5, "no-such-channel"), "a channel that isn't there")

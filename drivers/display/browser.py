@@ -217,9 +217,9 @@ class BrowserDisplay(Display):
                 continue
             if answer["type"] == "refused":
                 raise Refused(f"{self._name}: {' '.join(str(answer.get('reason', '')).split())}", _NOT_ONE_TO_ONE)
-            return self._checked(answer, cell_px)
+            return self._check_answer(answer, cell_px)
 
-    def _checked(self, answer: dict[str, Any], cell_px: int) -> Shown:
+    def _check_answer(self, answer: dict[str, Any], cell_px: int) -> Shown:
         canvas_px, screen_px = (_size(answer.get(key), self._name) for key in ("canvas_px", "screen_px"))
         if canvas_px != screen_px:
             raise Refused(

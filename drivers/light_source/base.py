@@ -36,7 +36,7 @@ class LightSource(Instrument):
 
 
 class SteppedLamp(LightSource):
-    """A lamp of one channel with whole steps of brightness, told so and asked for it by whatever reaches it.
+    """A lamp of one channel with whole steps of brightness, set and read back by its protocol.
 
     `timeout_s`: longest time for an answer; `settle_s`: longest time until it is steady.
     """
@@ -114,8 +114,8 @@ class SteppedLamp(LightSource):
         self._check_channel(channel)
         if not (math.isfinite(level) and 0.0 <= level <= 1.0):
             raise InstrumentError(f"{self._who}: a level of {level} is outside 0..1; ask for a share of its brightest")
-        with self._used() as found:
-            found.note("step", self._read())
+        with self._used() as kept:
+            kept.note("step", self._read())
             self._go(round(level * self._steps))
 
     def _check_channel(self, channel: str | None) -> None:
@@ -132,13 +132,13 @@ class SteppedLamp(LightSource):
             if self._stopped.wait(_LOOK_S):
                 raise Interrupted(f"{self._who}: stopped while it settles; start again")
             self._until = time.monotonic() + self._timeout_s
-        if (told := self._read()) != step:
-            raise InstrumentError(f"{self._who}: told to go to step {step:g} it says {told:g}; look at it")
+        if (reading := self._read()) != step:
+            raise InstrumentError(f"{self._who}: it was set to step {step:g} and reads {reading:g}; check the lamp")
 
-    def _restore(self, found: FoundSettings) -> None:
-        if "step" in found:
-            self._go(float(found.get("step", 0.0)))
-            found.forget("step")
+    def _restore(self, kept: FoundSettings) -> None:
+        if "step" in kept:
+            self._go(float(kept.get("step", 0.0)))
+            kept.forget("step")
 
     def stop(self) -> None:
         """Dark at once."""

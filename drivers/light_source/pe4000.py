@@ -87,7 +87,7 @@ class Pe4000(WireInstrument, LightSource):
         with self._conversation():
             led, letter = self._led(channel)
             state = self._states()[letter]
-            return state.percent / 100.0 if state.shines and self._loaded()[letter] == led else 0.0
+            return state.percent / 100.0 if state.shines and self._read_loaded()[letter] == led else 0.0
 
     def set_level(self, level: float, channel: str | None = None) -> None:
         if not (math.isfinite(level) and 0.0 <= level <= 1.0):
@@ -96,7 +96,7 @@ class Pe4000(WireInstrument, LightSource):
             )
         with self._conversation():
             led, letter = self._led(channel)
-            percent, state, loaded = round(100.0 * level), self._states()[letter], self._loaded()[letter]
+            percent, state, loaded = round(100.0 * level), self._states()[letter], self._read_loaded()[letter]
             if loaded != led:
                 if percent == 0:
                     return
@@ -112,7 +112,7 @@ class Pe4000(WireInstrument, LightSource):
 
     def settings(self) -> dict[str, Setting]:
         with self._conversation():
-            states, loaded = self._states(), self._loaded()
+            states, loaded = self._states(), self._read_loaded()
             return {
                 f"level_{led}_nm": states[letter].percent / 100.0 if states[letter].shines else 0.0
                 for letter, led in loaded.items()
@@ -129,11 +129,11 @@ class Pe4000(WireInstrument, LightSource):
         self._identity = Identity("CoolLED", model)
         self._leds = {}
         for line in self._ask("LAMBDAS", "LAMBDA:", _HELD * len(_LETTERS)):
-            found = re.fullmatch(r"LAMBDA:([A-D])\d=(\d*)", line)
-            if found is None:
+            match = re.fullmatch(r"LAMBDA:([A-D])\d=(\d*)", line)
+            if match is None:
                 raise self._strange("LAMBDAS", line)
-            if found[2]:
-                self._leds[found[2]] = found[1]
+            if match[2]:
+                self._leds[match[2]] = match[1]
         if not self._leds:
             raise InstrumentError(f"{self._transport.name}: it tells no LED; look whether any is fitted")
         self._restore()  # what a process that was killed, or an unplugged lamp, left changed
@@ -143,7 +143,7 @@ class Pe4000(WireInstrument, LightSource):
         states = self._states()
         lit = {letter: state for letter, state in states.items() if state.selected}
         if lit:
-            loaded = self._loaded()
+            loaded = self._read_loaded()
             for letter, state in lit.items():
                 self._note(letter, loaded[letter], state)
             self._set({letter: _Channel(False, False, state.percent) for letter, state in lit.items()})
@@ -166,9 +166,9 @@ class Pe4000(WireInstrument, LightSource):
         self._found.note(letter, f"{loaded} {state}")
 
     def _restore(self) -> None:
-        for letter, told in self._found.last_first():
-            led, _, state = str(told).partition(" ")
-            if self._loaded()[letter] != led:
+        for letter, kept in self._found.last_first():
+            led, _, state = str(kept).partition(" ")
+            if self._read_loaded()[letter] != led:
                 self._set({letter: _Channel(False, False, 0)})
                 self._load(letter, led)
             self._set({letter: _Channel.of(state[0], state[1], state[2:])})
@@ -182,20 +182,20 @@ class Pe4000(WireInstrument, LightSource):
         return led, self._leds[led]
 
     def _states(self) -> dict[str, _Channel]:
-        (told,) = self._ask("CSS?", "CSS")
-        states = {found[1]: _Channel.of(found[2], found[3], found[4]) for found in _STATE.finditer(told[3:])}
-        if not set(_LETTERS) <= set(states) or len(told) != 3 + 6 * len(states):
-            raise self._strange("CSS?", told)
+        (answer,) = self._ask("CSS?", "CSS")
+        states = {match[1]: _Channel.of(match[2], match[3], match[4]) for match in _STATE.finditer(answer[3:])}
+        if not set(_LETTERS) <= set(states) or len(answer) != 3 + 6 * len(states):
+            raise self._strange("CSS?", answer)
         return {letter: states[letter] for letter in _LETTERS}
 
-    def _loaded(self) -> dict[str, str]:
+    def _read_loaded(self) -> dict[str, str]:
         """Return the LED that is loaded in each channel, by its wavelength (nm)."""
         loaded: dict[str, str] = {}
         for line in self._ask("LAMS", "LAM:", len(_LETTERS)):
-            found = re.fullmatch(r"LAM:([A-D]):(\d+)", line)
-            if found is None:
+            match = re.fullmatch(r"LAM:([A-D]):(\d+)", line)
+            if match is None:
                 raise self._strange("LAMS", line)
-            loaded[found[1]] = found[2]
+            loaded[match[1]] = match[2]
         if len(loaded) != len(_LETTERS):
             raise self._strange("LAMS", str(loaded))
         return loaded
@@ -208,13 +208,14 @@ class Pe4000(WireInstrument, LightSource):
         for letter, state in wanted.items():
             if states[letter] != state:
                 raise InstrumentError(
-                    f"{self._transport.name}: told {letter}{state} channel {letter} says {states[letter]}; look at it"
+                    f"{self._transport.name}: channel {letter} was set to {letter}{state} and reads {states[letter]}; "
+                    "check the lamp"
                 )
 
     def _load(self, letter: str, led: str) -> None:
         self._ask(f"LOAD:{led}", "LOAD")
         until = time.monotonic() + self.load_timeout_s
-        while self._loaded()[letter] != led:
+        while self._read_loaded()[letter] != led:
             if time.monotonic() > until:
                 raise NoAnswer(
                     f"{self._transport.name}: {led} nm isn't loaded within {self.load_timeout_s:g} s; listen whether "
@@ -225,13 +226,13 @@ class Pe4000(WireInstrument, LightSource):
     def _ask(self, command: str, begins: str, lines: int = 1) -> list[str]:
         """Return the lines of an answer, which begin with a word; what else comes before them is no answer."""
         self._transport.write(command.encode("ascii") + b"\r")
-        told: list[str] = []
+        answers: list[str] = []
         for _ in range(_STALE_LINES + lines):
             line = self._transport.read_until(b"\r\n", asked=command).decode("latin-1").strip()
             if line.startswith(begins):
-                told.append(line)
-            if len(told) == lines:
-                return told
+                answers.append(line)
+            if len(answers) == lines:
+                return answers
         raise self._strange(command, line)
 
     def _strange(self, asked: str, answer: str) -> Garbled:

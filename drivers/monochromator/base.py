@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from drivers.errors import InstrumentError
 from drivers.instrument import Instrument, Setting
 
-#: How often the shutter is told to close, and asked whether it is, before that is given up.
+#: Attempts to close the shutter and read its state.
 SHUT_ATTEMPTS = 2
 
 
@@ -73,7 +73,15 @@ def order_sorting_filters(table: Sequence[object] | None) -> tuple[OrderSortingF
 
 
 def filter_place(filters: Sequence[OrderSortingFilter], wavelength_nm: float) -> int:
-    """Position of the order-sorting filter for a wavelength (nm). Raises `InstrumentError` if the table has none."""
+    """Choose the position of the order-sorting filter for a wavelength.
+
+    filters : rows of the table; wavelength_nm : nm
+
+    Returns the place. Raises `InstrumentError` where no row holds the wavelength.
+
+    >>> filter_place([OrderSortingFilter(2, 350.0, 600.0)], 550.0)
+    2
+    """
     for row in filters:
         if row.from_nm <= wavelength_nm < row.to_nm:
             return row.place
@@ -88,7 +96,7 @@ class Monochromator(Instrument):
     """A monochromator behind a light source. `stop` and `close` leave the shutter closed.
 
     One without a shutter has something in its place: a blank in the filter wheel, or a wavelength at which its lamp
-    gives no light. There it is parked, and goes to the wavelength that it was told when it is opened.
+    gives no light. It is parked there, and moves to the wavelength that was set when it is opened.
     """
 
     #: Whether light may get out, as far as this driver's own commands and the instrument's answers say.
@@ -104,7 +112,7 @@ class Monochromator(Instrument):
                     self._may_shine = False
                     return None
                 failure = failure or InstrumentError(
-                    "monochromator: its shutter is open though it was told to close; block the light by hand"
+                    "monochromator: its shutter is open after the command to close; block the light by hand"
                 )
                 self._may_shine = True
             except InstrumentError as error:
@@ -189,7 +197,15 @@ SLIT_LIMITS_UM = (4.0, 3000.0)
 
 
 def checked_slit_um(width_um: float) -> float:
-    """Return the slit width (um) if the slits can be set to it; raises `InstrumentError` if not (a NaN included)."""
+    """Check a slit width.
+
+    width_um : um
+
+    Returns it. Raises `InstrumentError` where the slits can't be set to it (a NaN included).
+
+    >>> checked_slit_um(500.0)
+    500.0
+    """
     low, high = SLIT_LIMITS_UM
     if not low <= width_um <= high:
         raise InstrumentError(
@@ -228,23 +244,38 @@ class HandSlits:
         return (f"{who}: its slits are set by hand, and no slit_um is stated: the bandwidth of its light isn't known",)
 
 
-def lines_per_mm(told: str, who: str) -> float:
-    """Lines per mm of the grating in use, of the answer `1,1200,VIS` to GRAT?. Raises `InstrumentError` for another
-    answer."""
+def lines_per_mm(text: str, who: str) -> float:
+    """Read the lines per mm of the grating in use from the answer to GRAT?.
+
+    text : `1,1200,VIS`; who : the instrument, for messages
+
+    Returns lines per mm. Raises `InstrumentError` for another answer.
+
+    >>> lines_per_mm("1,1200,VIS", "Cornerstone 260")
+    1200.0
+    """
     try:
-        lines = float(told.split(",")[1])
+        lines = float(text.split(",")[1])
     except (IndexError, ValueError):
         lines = 0.0
     if not lines > 0.0:
         raise InstrumentError(
-            f"{who}: says {told!r} of its grating, which has no lines per mm; state dispersion_nm_per_mm in the "
+            f"{who}: says {text!r} of its grating, which has no lines per mm; state dispersion_nm_per_mm in the "
             "station file"
         )
     return lines
 
 
 def checked_wavelength_nm(wavelength_nm: float, upper_nm: float) -> float:
-    """Return the wavelength (nm) if a grating can go there; raises `InstrumentError` if not (a NaN included)."""
+    """Check a wavelength.
+
+    wavelength_nm, upper_nm : nm, and the highest that the grating reaches
+
+    Returns it. Raises `InstrumentError` where the grating can't go there (a NaN included).
+
+    >>> checked_wavelength_nm(550.0, 1400.0)
+    550.0
+    """
     if not (math.isfinite(wavelength_nm) and 0.0 <= wavelength_nm <= upper_nm):
         raise InstrumentError(
             f"monochromator: {wavelength_nm} nm is outside 0..{upper_nm:g} nm; ask for a wavelength in this range"

@@ -116,9 +116,7 @@ class Cm110(WireInstrument, Monochromator):
     def open_shutter(self) -> None:
         with self._conversation():
             if self._next_nm is None:
-                raise InstrumentError(
-                    f"{self._transport.name}: was told no wavelength yet; move it before it is opened"
-                )
+                raise InstrumentError(f"{self._transport.name}: no wavelength was set yet; set one before it is opened")
             self._may_shine = True
             self._go(self._next_nm)
 

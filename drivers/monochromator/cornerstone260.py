@@ -267,16 +267,16 @@ class Cornerstone260(WireInstrument, Monochromator):
         return True
 
     def _let_go(self) -> None:
-        found = self._found
-        if found is None:
+        kept = self._found
+        if kept is None:
             return
-        if (units := str(found.get("UNITS", ""))) in {"UM", "WN"}:
+        if (units := str(kept.get("UNITS", ""))) in {"UM", "WN"}:
             self._do(f"UNITS {units}")
-        found.forget("UNITS")
-        if "HANDSHAKE" in found:
+        kept.forget("UNITS")
+        if "HANDSHAKE" in kept:
             self._transport.write(b"HANDSHAKE 0\r\n")
             self._transport.drain(quiet_s=0.1)
-            found.forget("HANDSHAKE")
+            kept.forget("HANDSHAKE")
 
     def _make_safe(self) -> None:
         self._move_shutter("C")
@@ -316,7 +316,7 @@ class Cornerstone260(WireInstrument, Monochromator):
         if status in _FAILED:
             code = self._error_number()
             if code != _ALREADY_THERE:
-                raise self._refused(statement, code)
+                raise self._describe_refusal(statement, code)
         elif status not in _DONE:
             raise self._strange(statement, status)
 
@@ -339,11 +339,11 @@ class Cornerstone260(WireInstrument, Monochromator):
             try:
                 status = self._line(query, 0.3)
             except NoAnswer:
-                raise self._refused(query, self._error_number()) from None
+                raise self._describe_refusal(query, self._error_number()) from None
         else:
             status = self._line(query)
         if status in _FAILED:
-            raise self._refused(query, self._error_number())
+            raise self._describe_refusal(query, self._error_number())
         if status not in _DONE:
             raise self._strange(query, status)
         return reply
@@ -377,7 +377,7 @@ class Cornerstone260(WireInstrument, Monochromator):
     def _line(self, asked: str, timeout_s: float | None = None) -> str:
         return self._transport.read_until(b"\r\n", timeout_s, asked).decode("latin-1").strip()
 
-    def _refused(self, statement: str, code: int) -> InstrumentError:
+    def _describe_refusal(self, statement: str, code: int) -> InstrumentError:
         meaning = ERRORS.get(code, "unknown error")
         return Refused(
             f"{self._transport.name}: refused {statement!r}: error {code}, {meaning}; check the value against the "

@@ -127,9 +127,9 @@ class Sp2150(WireInstrument, Monochromator):
         with self._conversation():
             if self.selected_filter() != place:
                 self._ask(f"{place} FILTER", self.move_timeout_s)
-                if (found := self.selected_filter()) != place:
+                if (at_place := self.selected_filter()) != place:
                     raise Garbled(
-                        f"{self._transport.name}: its filter wheel stands at {found} after a move to {place}; "
+                        f"{self._transport.name}: its filter wheel stands at {at_place} after a move to {place}; "
                         "check that nothing blocks it"
                     )
 
@@ -179,18 +179,18 @@ class Sp2150(WireInstrument, Monochromator):
         """Return the number and the lines per mm of the grating in use: the answer marks its row with 1A (hex)."""
         with self._conversation():
             answer = self._ask("?GRATINGS")
-            found = re.search(r"\x1a\s*(\d+)\s+(\d+) *g/mm", answer)
-            if found is None:
+            match = re.search(r"\x1a\s*(\d+)\s+(\d+) *g/mm", answer)
+            if match is None:
                 raise self._strange("?GRATINGS", answer)
-            return int(found[1]), float(found[2])
+            return int(match[1]), float(match[2])
 
     def _number(self, query: str) -> float:
         with self._conversation():
             answer = self._ask(query)
-            found = _NUMBER.match(answer)
-            if found is None:
+            match = _NUMBER.match(answer)
+            if match is None:
                 raise self._strange(query, answer)
-            return float(found[0])
+            return float(match[0])
 
     def _ask(self, command: str, timeout_s: float | None = None) -> str:
         """Return what is between the echo of a command and ` ok`. Raises `Refused` where `?` ends it."""
@@ -201,10 +201,10 @@ class Sp2150(WireInstrument, Monochromator):
         text = ""
         for _ in range(_MOST_LINES):
             text += self._transport.read_until(b"\n", timeout_s, command).decode("latin-1")
-            said = text.strip().removeprefix(command).strip(" \r\n")
-            if said == "ok" or said.endswith((" ok", "\nok")):
-                return said.removesuffix("ok").strip(" \r\n")
-            if said.endswith("?"):
+            reply = text.strip().removeprefix(command).strip(" \r\n")
+            if reply == "ok" or reply.endswith((" ok", "\nok")):
+                return reply.removesuffix("ok").strip(" \r\n")
+            if reply.endswith("?"):
                 raise Refused(f"{self._transport.name}: doesn't know {command!r}; check that it has this accessory", 0)
         raise self._strange(command, text)
 

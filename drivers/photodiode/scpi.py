@@ -33,7 +33,7 @@ _PIECE = 4096
 #: A reading or the number of an error: no identity begins so, a late answer to what was asked before does.
 _NUMBER = re.compile(r"\s*[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\s*[^\W\d]{0,5}\s*(?:,|$)")
 _MOST_LATE = 3
-#: How long (s) a meter that has told its identity is silent, unless it tells it again to a connection before.
+#: How long (s) a meter is silent after its identity, unless it repeats it to an earlier connection.
 _QUIET_S = 0.1
 #: What sets a meter to direct current, by what its identity holds; the last one is every other meter's.
 _SETUP: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -99,8 +99,8 @@ class ScpiPhotodiode(Photodiode):
 
     def measure_dark(self) -> float:
         with self._conversation():
-            found = self._currents()
-            self._dark_a, self._var_dark = float(np.mean(found)), _variance_of_mean(found)
+            currents = self._currents()
+            self._dark_a, self._var_dark = float(np.mean(currents)), _variance_of_mean(currents)
             return self._dark_a
 
     def check_nm(self, wavelength_nm: float) -> None:
@@ -114,11 +114,11 @@ class ScpiPhotodiode(Photodiode):
     def measure(self, wavelength_nm: float) -> IrradianceMeasurement:
         self.check_nm(wavelength_nm)
         with self._conversation():
-            found = self._currents()
-            current_a = float(np.mean(found)) - self._dark_a
+            currents = self._currents()
+            current_a = float(np.mean(currents)) - self._dark_a
             watts_per_amp_m2 = 1.0 / (float(self._responsivity.at(np.array([wavelength_nm]))[0]) * self.area_m2)
             irradiance = current_a * watts_per_amp_m2
-            var = (_variance_of_mean(found) + self._var_dark) * watts_per_amp_m2**2 + (
+            var = (_variance_of_mean(currents) + self._var_dark) * watts_per_amp_m2**2 + (
                 self.calibration_sd * irradiance
             ) ** 2
             return IrradianceMeasurement(
@@ -178,12 +178,12 @@ class ScpiPhotodiode(Photodiode):
                 f"{self._who}: can't be opened ({reason}); check the cable, the power and the address"
             ) from error
         try:
-            told = self._first_answer()
-            maker, model, serial_number, firmware = (*(part.strip() for part in told.split(",")), "", "", "", "")[:4]
+            answer = self._first_answer()
+            maker, model, serial_number, firmware = (*(part.strip() for part in answer.split(",")), "", "", "", "")[:4]
             self._identity = Identity(maker, model, serial_number, firmware)
             commands = self.setup
             if commands is None:
-                commands = next(setup for mark, setup in _SETUP if mark in told.upper())
+                commands = next(setup for mark, setup in _SETUP if mark in answer.upper())
             for command in ("*CLS", *commands):
                 self._say(command)
             code, _, text = self._ask("SYST:ERR?").partition(",")
@@ -201,18 +201,18 @@ class ScpiPhotodiode(Photodiode):
         """Return its identity, and leave nothing behind of what was asked before. PyVISA opens a TCP address without
         looking whether anyone is there."""
         try:
-            told = self._ask("*IDN?")
+            answer = self._ask("*IDN?")
             for _ in range(_MOST_LATE):
-                if not _NUMBER.match(told):
+                if not _NUMBER.match(answer):
                     break
-                told = self._heard("*IDN?")
+                answer = self._heard("*IDN?")
             self._drain()
         except Disconnected as error:
             reason = str(error.__cause__).partition(":")[0] if error.__cause__ is not None else str(error)
             raise Disconnected(
                 f"{self._who}: can't be reached ({reason}); check the cable, the power and the address"
             ) from error
-        return told
+        return answer
 
     def _currents(self) -> list[float]:
         return [self._current() for _ in range(self.readings)]

@@ -50,7 +50,7 @@ class Cr300(WireInstrument, Spectroradiometer):
             self._ask("M", self.measure_timeout_s)
             self._say("RM Spectrum")
             self._transport.pause(_GATHERING_S, "RM Spectrum")
-            spectrum = self._read_spectrum(self._checked("RM Spectrum", self._line("RM Spectrum")))
+            spectrum = self._read_spectrum(self._check_answer("RM Spectrum", self._line("RM Spectrum")))
             return RadianceMeasurement(spectrum, self._integration_time_s(), self._identity.serial_number)
 
     # --- the wire ---------------------------------------------------------------------------------------------------
@@ -65,7 +65,7 @@ class Cr300(WireInstrument, Spectroradiometer):
             first = first.removeprefix("RC ID").strip() or self._line("RC ID")
             self._say("E")
             line.drain(quiet_s=0.1)
-        serial_number = self._checked("RC ID", first)
+        serial_number = self._check_answer("RC ID", first)
         self._identity = Identity(
             "Colorimetry Research", self._ask("RC Model"), serial_number, self._ask("RC Firmware")
         )
@@ -106,7 +106,7 @@ class Cr300(WireInstrument, Spectroradiometer):
 
     def _ask(self, command: str, timeout_s: float | None = None) -> str:
         self._say(command)
-        return self._checked(command, self._line(command, timeout_s))
+        return self._check_answer(command, self._line(command, timeout_s))
 
     def _say(self, command: str) -> None:
         self._transport.write(command.encode("ascii") + b"\n")
@@ -114,7 +114,7 @@ class Cr300(WireInstrument, Spectroradiometer):
     def _line(self, asked: str, timeout_s: float | None = None) -> str:
         return self._transport.read_until(b"\r\n", timeout_s, asked).decode("latin-1").strip()
 
-    def _checked(self, asked: str, answer: str) -> str:
+    def _check_answer(self, asked: str, answer: str) -> str:
         """Return the text of an answer. Raises `Refused` with the instrument's code."""
         kind, _, rest = answer.partition(":")
         code, _, rest = rest.partition(":")

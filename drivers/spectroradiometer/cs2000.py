@@ -67,7 +67,7 @@ class Cs2000(WireInstrument, Spectroradiometer):
                     f"{self._transport.name}: this measurement takes {seconds} s, more than {self.measure_timeout_s:g} "
                     "s; give it more light, or allow it a longer measure_timeout_s"
                 )
-            if rest := self._checked("MEAS,1", self._line("MEAS,1", self.measure_timeout_s)):
+            if rest := self._check_answer("MEAS,1", self._line("MEAS,1", self.measure_timeout_s)):
                 raise self._strange("MEAS,1", f"OK00,{rest}")
             values = [value for piece, count in PIECES.items() for value in self._values(f"MEDR,1,0,{piece}", count)]
             spectrum = Spectrum.of(range(FIRST_NM, LAST_NM + 1), values)
@@ -114,12 +114,12 @@ class Cs2000(WireInstrument, Spectroradiometer):
 
     def _ask(self, command: str) -> str:
         self._transport.write(command.encode("ascii") + b"\n")
-        return self._checked(command, self._line(command))
+        return self._check_answer(command, self._line(command))
 
     def _line(self, asked: str, timeout_s: float | None = None) -> str:
         return self._transport.read_until(b"\n", timeout_s, asked).decode("latin-1").strip()
 
-    def _checked(self, asked: str, answer: str) -> str:
+    def _check_answer(self, asked: str, answer: str) -> str:
         """Return what follows OK00. Raises `Refused` for ERnn."""
         code, _, rest = answer.partition(",")
         if code == "OK00":

@@ -129,8 +129,8 @@ class OceanOptics(Spectroradiometer):
 
     def _nonlinearity(self) -> FloatArray:
         """Return the maker's polynomial; 1 where the model keeps none."""
-        found = getattr(self._open.f, "nonlinearity_coefficients", None)
-        bend = np.array([] if found is None else found.get_nonlinearity_coefficients(), float)
+        coefficients = getattr(self._open.f, "nonlinearity_coefficients", None)
+        bend = np.array([] if coefficients is None else coefficients.get_nonlinearity_coefficients(), float)
         return bend if bend.size and np.any(bend != 0) else np.ones(1)
 
     def _dark(self, counts: FloatArray) -> float:
@@ -141,7 +141,7 @@ class OceanOptics(Spectroradiometer):
 
     def identity(self) -> Identity:
         with self._lock:
-            serial_number = str(self._connected().serial_number)
+            serial_number = str(self._connect_once().serial_number)
             return Identity("Ocean Optics", self._model.replace("PLUS", "+"), serial_number)
 
     def measure(self) -> RadianceMeasurement:
@@ -149,7 +149,7 @@ class OceanOptics(Spectroradiometer):
         nonlinearity, divided by the response."""
         with self._lock:
             self._stopped.clear()
-            pixels = self._connected().f.spectrometer
+            pixels = self._connect_once().f.spectrometer
             try:
                 integration_s = self._choose_time(pixels)
                 scans = [self._scan(pixels) for _ in range(self.averages)]
@@ -174,7 +174,7 @@ class OceanOptics(Spectroradiometer):
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
-    def _connected(self) -> Any:
+    def _connect_once(self) -> Any:
         if self._open is None:
             self.connect()
         return self._open

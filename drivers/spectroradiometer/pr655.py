@@ -94,14 +94,14 @@ class Pr655(WireInstrument, Spectroradiometer):
         self._transport.write(b"Q")
 
     def _read_spectrum(self) -> Spectrum:
-        self._checked("M5", self._line("M5", self.measure_timeout_s))  # the header's first line
-        found = self._pair(self._line("M5"), may_be_a_header=True) or self._pair(self._line("M5"))
-        while max(found) < LAST_NM:
-            found |= self._pair(self._line("M5"))
-        wavelengths = list(found)
+        self._check_answer("M5", self._line("M5", self.measure_timeout_s))  # the header's first line
+        pairs = self._pair(self._line("M5"), may_be_a_header=True) or self._pair(self._line("M5"))
+        while max(pairs) < LAST_NM:
+            pairs |= self._pair(self._line("M5"))
+        wavelengths = list(pairs)
         if wavelengths != sorted(wavelengths) or wavelengths[0] != FIRST_NM:
             raise self._strange("M5", f"{wavelengths[:8]}".encode())
-        return Spectrum.of(wavelengths, list(found.values()))
+        return Spectrum.of(wavelengths, list(pairs.values()))
 
     def _pair(self, line: str, may_be_a_header: bool = False) -> dict[float, float]:
         """Wavelength and value of a line; nothing for a line of the header."""
@@ -124,12 +124,12 @@ class Pr655(WireInstrument, Spectroradiometer):
     def _ask(self, command: str) -> str:
         """Return what follows the quality code of an answer of one line."""
         self._transport.write(command.encode("ascii") + b"\r")
-        return self._checked(command, self._line(command))
+        return self._check_answer(command, self._line(command))
 
     def _line(self, asked: str, timeout_s: float | None = None) -> str:
         return self._transport.read_until(b"\r\n", timeout_s, asked).decode("latin-1").strip()
 
-    def _checked(self, asked: str, answer: str) -> str:
+    def _check_answer(self, asked: str, answer: str) -> str:
         """`answer` without its quality code. Raises `Refused` for any other than 0."""
         code, _, rest = answer.partition(",")
         try:

@@ -84,7 +84,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         with self._conversation():
             while True:
                 try:
-                    spectrum = self._measured()
+                    spectrum = self._read_measured()
                 except Refused as error:
                     # Later the spectra of a session would cover different ranges.
                     if error.code != OUT_OF_RANGE or self._has_measured or not self._narrow():
@@ -93,7 +93,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
                     self._has_measured = True
                     return RadianceMeasurement(spectrum, self._integration_time_s(), self._identity.serial_number)
 
-    def _measured(self) -> Spectrum:
+    def _read_measured(self) -> Spectrum:
         begin = "*init"
         if self._spectraval:
             self._set("*para:form 0")  # the spectrum is asked for once it is measured
@@ -155,13 +155,13 @@ class Specbos1211(WireInstrument, Spectroradiometer):
     def _choose_range(self) -> None:
         """The range asked for if the unit is calibrated there, or all that it is. Raises `InstrumentError`."""
         if self._spectraval:
-            told = re.findall(r"\d+(?:\.\d+)?", self._ask("*para:wran?"))[:2]
+            limits = re.findall(r"\d+(?:\.\d+)?", self._ask("*para:wran?"))[:2]
         else:
-            told = [re.sub(r"^.*:\s*", "", self._ask(f"*para:{end}?")) for end in ("wavbeg", "wavend")]
+            limits = [re.sub(r"^.*:\s*", "", self._ask(f"*para:{end}?")) for end in ("wavbeg", "wavend")]
         try:
-            first, last = (float(text.split()[0]) for text in told)
+            first, last = (float(text.split()[0]) for text in limits)
         except (ValueError, IndexError):
-            raise self._strange("*para:wavbeg?", " ".join(told).encode("latin-1")) from None
+            raise self._strange("*para:wavbeg?", " ".join(limits).encode("latin-1")) from None
         low, high = math.ceil(first), math.floor(last)
         wanted = [low if self._wanted_nm[0] is None else self._wanted_nm[0]]
         wanted += [high if self._wanted_nm[1] is None else self._wanted_nm[1]]
@@ -212,12 +212,12 @@ class Specbos1211(WireInstrument, Spectroradiometer):
             except InstrumentError as error:
                 failure = failure or error
                 continue
-            if found := re.fullmatch(r"JETI_SB(\d+)", answer):
-                return f"specbos {found[1]}"
+            if match := re.fullmatch(r"JETI_SB(\d+)", answer):
+                return f"specbos {match[1]}"
             if answer.startswith("SB05"):
                 return "specbos 1201"
-            if found := re.match(r"JETI_SDCM3|DCM3_JETI|S?PECFIRM_JETI_(15\d1)", answer):
-                return f"spectraval {found[1] or 1501}"
+            if match := re.match(r"JETI_SDCM3|DCM3_JETI|S?PECFIRM_JETI_(15\d1)", answer):
+                return f"spectraval {match[1] or 1501}"
             failure = self._strange("*idn?", answer.encode("latin-1"))
         line.baudrate = self.baudrates[0]
         assert failure is not None
@@ -247,17 +247,17 @@ class Specbos1211(WireInstrument, Spectroradiometer):
 
     def _byte(self, asked: str, timeout_s: float | None = None) -> bytes:
         """Return the next byte that isn't ENQ."""
-        while (one := self._transport.read(1, timeout_s, asked)) == ENQ:
+        while (byte := self._transport.read(1, timeout_s, asked)) == ENQ:
             pass
-        return one
+        return byte
 
     def _refusal(self, command: str) -> InstrumentError:
         self._transport.write(b"*stat:err?\r")
         answer = self._transport.read_until(b"\r", asked="*stat:err?").decode("latin-1")
-        found = re.search(r"(\d+)\s*$", answer.strip())
-        if not found:
+        match = re.search(r"(\d+)\s*$", answer.strip())
+        if not match:
             return self._strange("*stat:err?", answer.encode("latin-1"))
-        code = int(found[1])
+        code = int(match[1])
         meaning, remedy = ERRORS.get(code, ("an error of its own", "look it up in its manual"))
         return Refused(f"{self._transport.name}: {command!r} failed: error {code}, {meaning}; {remedy}", code)
 
@@ -284,16 +284,16 @@ class Specbos1211(WireInstrument, Spectroradiometer):
             raise self._refusal(query)
         if self._spectraval:
             text = (first + line.read_until(ETX, self.fetch_timeout_s, query)).removesuffix(ETX).replace(ENQ, b"")
-            told = [piece for piece in text.split(b"\r") if piece.strip()]
-            if len(told) != len(wavelengths):
-                raise Garbled(f"{line.name}: sent {len(told)} values where {len(wavelengths)} were asked for")
+            pieces = [piece for piece in text.split(b"\r") if piece.strip()]
+            if len(pieces) != len(wavelengths):
+                raise Garbled(f"{line.name}: sent {len(pieces)} values where {len(wavelengths)} were asked for")
         else:
             began = first if first == b"\r" else first + line.read_until(b"\r", self.fetch_timeout_s, query)
             # Within a reply characters follow each other: a pause of a second is where it broke off.
             pause_s = min(1.0, self.fetch_timeout_s)
             rest_of_it = (line.read_until(b"\r", pause_s, query) for _ in range(header + len(wavelengths) - 1))
-            told = [piece.replace(ENQ, b"").strip() for piece in (began, *rest_of_it)]
-        values = [self._value(query, nm, text) for nm, text in zip(wavelengths, told[header:], strict=True)]
+            pieces = [piece.replace(ENQ, b"").strip() for piece in (began, *rest_of_it)]
+        values = [self._value(query, nm, text) for nm, text in zip(wavelengths, pieces[header:], strict=True)]
         rest = line.drain(quiet_s=AFTER_S)
         if rest.strip():
             raise Garbled(
@@ -304,20 +304,20 @@ class Specbos1211(WireInstrument, Spectroradiometer):
 
     def _value(self, query: str, wavelength_nm: int, text: bytes) -> float:
         try:
-            *beside, value = (float(word) for word in text.split())
+            *others, value = (float(word) for word in text.split())
         except ValueError:
             raise self._strange(query, text) from None
-        if not math.isfinite(value) or beside != ([float(wavelength_nm)] if self._spectraval else []):
+        if not math.isfinite(value) or others != ([float(wavelength_nm)] if self._spectraval else []):
             raise self._strange(query, text)
         return value
 
     def _integration_time_s(self) -> float | None:
         """Integration time of the last measurement; None where the firmware doesn't report it."""
         try:
-            found = re.search(r"(\d+(?:\.\d+)?)\s*(?:ms)?\s*$", self._ask("*fetch:tint"))
+            match = re.search(r"(\d+(?:\.\d+)?)\s*(?:ms)?\s*$", self._ask("*fetch:tint"))
         except Refused:
             return None
-        return float(found[1]) / 1000.0 if found else None
+        return float(match[1]) / 1000.0 if match else None
 
     def _strange(self, asked: str, answer: bytes) -> Garbled:
         return Garbled(

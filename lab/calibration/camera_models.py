@@ -116,10 +116,10 @@ def bring_in(store: Store, cameras: Mapping[Side, CameraFile]) -> str:
 def remove(store: Store, model_id: str) -> None:
     """Delete a model that was sent in, for ever. Raises InputError where there is none, and for one that a fit or a
     diagnosis found."""
-    found = record(store, model_id)
-    if found.kind != "sent":
+    model = record(store, model_id)
+    if model.kind != "sent":
         raise InputError(
-            f"camera model {model_id}: is {found.kind}, part of a result; only those that were sent in can be deleted"
+            f"camera model {model_id}: is {model.kind}, part of a result; only those that were sent in can be deleted"
         )
     with store.transaction() as db:
         db.execute(sa.delete(ResultRow).where(ResultRow.id == model_id))
@@ -143,16 +143,16 @@ def _record(store: Store, row: Any) -> CameraModelRecord:
     return CameraModelRecord(id=row.id, kind=KINDS[row.kind], source=row.source, created=row.created, sides=sides)
 
 
-def _asked() -> Any:
+def _select_models() -> Any:
     return sa.select(ResultRow.id, ResultRow.kind, ResultRow.source, ResultRow.created).where(ResultRow.kind.in_(KINDS))
 
 
 def records(store: Store, after: str | None = None, limit: int | None = None) -> list[CameraModelRecord]:
     """Camera models, the newest first: `limit` at most, those that follow `after` in this order."""
-    asked = _asked().order_by(ResultRow.created.desc(), ResultRow.id.desc()).limit(limit)
+    asked = _select_models().order_by(ResultRow.created.desc(), ResultRow.id.desc()).limit(limit)
     with store.reading() as db:
         if after is not None:
-            last = db.execute(_asked().where(ResultRow.id == after)).first()
+            last = db.execute(_select_models().where(ResultRow.id == after)).first()
             if last is None:
                 raise InputError(f"camera model {after!r} isn't known; list them for their ids")
             asked = asked.where(sa.tuple_(ResultRow.created, ResultRow.id) < sa.tuple_(last.created, last.id))
@@ -169,7 +169,7 @@ def count(store: Store) -> int:
 def record(store: Store, result_id: str) -> CameraModelRecord:
     """One. Raises InputError where there is none."""
     with store.reading() as db:
-        row = db.execute(_asked().where(ResultRow.id == result_id)).first()
+        row = db.execute(_select_models().where(ResultRow.id == result_id)).first()
     if row is None:
         raise InputError(f"no camera model {result_id[:60]!r}; list them for their ids")
     return _record(store, row)
@@ -180,20 +180,22 @@ def files(store: Store, result_id: str) -> Iterator[Path]:
     yield from sorted(_folder(store, result_id).iterdir())
 
 
-def camera_files(store: Store, found: CameraModelRecord) -> dict[Side, CameraFile]:
+def camera_files(store: Store, model: CameraModelRecord) -> dict[Side, CameraFile]:
     """Return the cameras themselves."""
-    folder = _folder(store, found.id)
-    return {side: read_camera(folder / f"{side}.toml") for side in found.sides}
+    folder = _folder(store, model.id)
+    return {side: read_camera(folder / f"{side}.toml") for side in model.sides}
 
 
-def cameras(store: Store, found: CameraModelRecord) -> dict[Side, ModelOfCamera]:
+def cameras(store: Store, model: CameraModelRecord) -> dict[Side, ModelOfCamera]:
     """Return what each camera file says."""
-    return {side: _camera(content) for side, content in camera_files(store, found).items()}
+    return {side: _camera(content) for side, content in camera_files(store, model).items()}
 
 
 def _camera(content: CameraFile) -> ModelOfCamera:
     model = content.camera
-    lens = [one.model_copy(update={"name": f"lens.{one.name}"}) for one in _parameters(model.lens, {})]
+    lens = [
+        parameter.model_copy(update={"name": f"lens.{parameter.name}"}) for parameter in _parameters(model.lens, {})
+    ]
     return ModelOfCamera(
         name=content.name,
         cfa=model.cfa,

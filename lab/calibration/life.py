@@ -152,19 +152,16 @@ class DriftBoard(Frozen):
     rows: tuple[BoardRow, ...]
 
 
-# --- cameras ----------------------------------------------------------------------------------------------------------
-
-
 def cameras_of(instruments: Snapshots, station: Station) -> dict[Side, str]:
     """Name of each camera of a run: maker, model and serial number as it reports them. Without a serial number it is
     known by its station and side."""
-    found: dict[Side, str] = {}
+    cameras: dict[Side, str] = {}
     for side in station.sides:
-        one = instruments.get(f"camera {side}", InstrumentSnapshot())
-        parts = [one.maker, one.model, one.serial_number]
+        camera = instruments.get(f"camera {side}", InstrumentSnapshot())
+        parts = [camera.maker, camera.model, camera.serial_number]
         where = [] if parts[2] else [f"({side} of {station.name or 'a station'})"]
-        found[side] = " ".join([part for part in parts if part] + where)
-    return found
+        cameras[side] = " ".join([part for part in parts if part] + where)
+    return cameras
 
 
 def rig_of(cameras: Mapping[Side, str]) -> str:
@@ -177,22 +174,26 @@ def check_certified(store: Store, instruments: Snapshots, station: Station) -> N
     have the settings."""
     register(store)
     cameras = cameras_of(instruments, station)
-    asked = _asked().order_by(CalibrationRow.created.desc())
+    asked = _select_rows().order_by(CalibrationRow.created.desc())
     with store.reading() as db:
         of_rig = db.execute(asked.where(CalibrationRow.rig == rig_of(cameras)))
-        found = [_calibration(row, name) for row, name in of_rig]
-        others = [_calibration(row, name) for row, name in ([] if found else db.execute(asked))]
-    for one in found:
-        if one.state == "certified":
-            _check_settings(store, one, instruments, cameras)
+        history = [_calibration(row, name) for row, name in of_rig]
+        others = [_calibration(row, name) for row, name in ([] if history else db.execute(asked))]
+    for calibration in history:
+        if calibration.state == "certified":
+            _check_settings(store, calibration, instruments, cameras)
             return
-    expired = [one for one in found if one.state == "expired"]
+    expired = [calibration for calibration in history if calibration.state == "expired"]
     why = (
         f"its certified calibration {expired[0].id} expired on {expired[0].expires:%Y-%m-%d}"
         if expired and expired[0].expires
-        else f"{len(found)} calibrations of it are known, none is certified"
+        else f"{len(history)} calibrations of it are known, none is certified"
     )
-    for other in [one for one in others if one.state == "certified" and one.cameras.keys() == cameras.keys()][:1]:
+    for other in [
+        calibration
+        for calibration in others
+        if calibration.state == "certified" and calibration.cameras.keys() == cameras.keys()
+    ][:1]:
         changed = [
             f"{side} was {was}, is {cameras[side]}" for side, was in other.cameras.items() if was != cameras[side]
         ]
@@ -224,17 +225,17 @@ def check_nothing_rests_on(store: Store, session_id: str) -> None:
     without it."""
     register(store)
     with store.reading() as db:
-        found = [_calibration(*row) for row in db.execute(_asked().where(CalibrationRow.session_id == session_id))]
-    for one in found:
-        if one.state == "certified":
+        calibrations = [
+            _calibration(*row) for row in db.execute(_select_rows().where(CalibrationRow.session_id == session_id))
+        ]
+    for calibration in calibrations:
+        if calibration.state == "certified":
             raise InputError(
-                f"session {session_id}: the certified calibration {one.id} rests on it; its captures are kept until "
+                f"session {session_id}: the certified calibration {calibration.id} rests on it; its captures are kept "
+                "until "
                 "that is "
                 "superseded or expired"
             )
-
-
-# --- registering ------------------------------------------------------------------------------------------------------
 
 
 def register(store: Store) -> None:
@@ -255,7 +256,7 @@ def _register(store: Store, missing: Sequence[str]) -> None:
     columns = (ResultRow.id, ResultRow.created, ResultRow.document, SessionRow.id, SessionRow.station, SessionRow.runs)
     asked = sa.select(*columns).join(SessionRow, SessionRow.id == ResultRow.source).where(ResultRow.id.in_(missing))
     with store.reading() as db:
-        entries = [_entry(*found) for found in db.execute(asked)]
+        entries = [_entry(*entry) for entry in db.execute(asked)]
     with store.transaction() as db:
         known = set(db.scalars(sa.select(CalibrationRow.id).where(CalibrationRow.id.in_(missing))))
         fresh = [entry for entry in entries if entry[0]["id"] not in known]  # else another process was faster
@@ -295,9 +296,6 @@ def _entry(
     return row, figures
 
 
-# --- reading ----------------------------------------------------------------------------------------------------------
-
-
 def _aware(at: datetime | None) -> datetime | None:
     return at.replace(tzinfo=UTC) if at is not None and at.tzinfo is None else at
 
@@ -330,11 +328,11 @@ def _calibration(row: CalibrationRow, name: str) -> CalibrationRecord:
         revoked_by=row.revoked_by,
         revoked_why=row.revoked_why,
         limits=None if row.limits is None else CalibrationLimits.model_validate(row.limits),
-        judgements=tuple(Judgement.model_validate(one) for one in row.judgements or ()),
+        judgements=tuple(Judgement.model_validate(judgement) for judgement in row.judgements or ()),
     )
 
 
-def _asked() -> Any:
+def _select_rows() -> Any:
     """Calibrations with their sessions' names; a session that was deleted has its id for one."""
     name = sa.func.coalesce(SessionRow.name, CalibrationRow.session_id)
     return sa.select(CalibrationRow, name).outerjoin(SessionRow, SessionRow.id == CalibrationRow.session_id)
@@ -343,7 +341,7 @@ def _asked() -> Any:
 def calibrations(store: Store, after: str | None = None, limit: int | None = None) -> list[CalibrationRecord]:
     """Calibrations, the newest first: `limit` at most, those that follow the calibration `after` in this order."""
     register(store)
-    asked = _asked().order_by(CalibrationRow.created.desc(), CalibrationRow.id.desc()).limit(limit)
+    asked = _select_rows().order_by(CalibrationRow.created.desc(), CalibrationRow.id.desc()).limit(limit)
     with store.reading() as db:
         if after is not None:
             last = db.get(CalibrationRow, after)
@@ -363,12 +361,12 @@ def count_calibrations(store: Store) -> int:
 def calibration(store: Store, id: str) -> CalibrationRecord:
     """One calibration, by its own id or by its session's: the newest of that. Raises InputError where there is none."""
     register(store)
-    wanted = _asked().where(sa.or_(CalibrationRow.id == id, CalibrationRow.session_id == id))
+    wanted = _select_rows().where(sa.or_(CalibrationRow.id == id, CalibrationRow.session_id == id))
     with store.reading() as db:
-        found = db.execute(wanted.order_by(CalibrationRow.created.desc())).first()
-    if found is None:
+        newest = db.execute(wanted.order_by(CalibrationRow.created.desc())).first()
+    if newest is None:
         raise InputError(f"calibration {id!r} isn't known; `calibench calibrations list` lists those that are")
-    return _calibration(*found)
+    return _calibration(*newest)
 
 
 def _figure(row: Any) -> Figure:
@@ -398,9 +396,6 @@ def figure_names(store: Store) -> list[tuple[str, str, str]]:
         return [(camera, name, place) for camera, name, place in sorted(db.execute(asked))]
 
 
-# --- certifying -------------------------------------------------------------------------------------------------------
-
-
 def certify(
     store: Store, id: str, by: str, limits: CalibrationLimits, *, accept_warnings: bool = False
 ) -> CalibrationRecord:
@@ -415,13 +410,13 @@ def certify(
         raise InputError(
             f"calibration {wanted.id}: is {wanted.state}, only a candidate can be certified; fit the session again"
         )
-    found = judged(figures(store, wanted.id), limits)
+    judgements = judged(figures(store, wanted.id), limits)
     refused = ("bad", "missing") if accept_warnings else ("warn", "bad", "missing")
-    if lines := [_refusal(wanted.id, one) for one in found if one.mark in refused]:
+    if lines := [_refusal(wanted.id, judgement) for judgement in judgements if judgement.mark in refused]:
         raise InputError("\n".join(lines))
     drafts, whence = drafted_limits(store, wanted.id)
-    bands = {(one.figure, one.side, one.place, one.good) for one in drafts}
-    is_drafted = any((one.figure, one.side, one.place, one.good) in bands for one in limits.limit)
+    bands = {(draft.figure, draft.side, draft.place, draft.good) for draft in drafts}
+    is_drafted = any((limit.figure, limit.side, limit.place, limit.good) in bands for limit in limits.limit)
     limits = limits.model_copy(update={"drafted_from": whence if is_drafted else ()})
     at = now()
     with store.transaction() as db:
@@ -435,11 +430,11 @@ def certify(
                 CalibrationRow.superseded.is_(None),
             )
         ).all()
-        for one in earlier:
-            one.superseded, one.superseded_by = at, row.id
+        for predecessor in earlier:
+            predecessor.superseded, predecessor.superseded_by = at, row.id
         row.certified, row.certified_by = at, by[:100]
         row.limits = limits.model_dump(mode="json")
-        row.judgements = [one.model_dump(mode="json") for one in found]
+        row.judgements = [judgement.model_dump(mode="json") for judgement in judgements]
         row.expires = None if limits.valid_days is None else at + timedelta(days=limits.valid_days)
     return calibration(store, wanted.id)
 
@@ -459,18 +454,19 @@ def revoke(store: Store, id: str, by: str, why: str) -> CalibrationRecord:
     return calibration(store, wanted.id)
 
 
-def _refusal(id: str, one: Judgement) -> str:
-    where = " ".join(part for part in (one.side, one.figure, one.place) if part)
-    if one.value is None:
+def _refusal(id: str, judgement: Judgement) -> str:
+    where = " ".join(part for part in (judgement.side, judgement.figure, judgement.place) if part)
+    if judgement.value is None:
         return (
             f"calibration {id}: {where}: the calibration doesn't have it; capture what determines it, or take the "
             "limit out"
         )
     return (
-        f"calibration {id}: {where} = {one.value:.6g} +- {one.std:.2g} is {one.mark}, good is {one.limit.good_text}; "
+        f"calibration {id}: {where} = {judgement.value:.6g} +- {judgement.std:.2g} is {judgement.mark}, good is "
+        f"{judgement.limit.good_text}; "
         + (
             "find out why, or accept warnings"
-            if one.mark == "warn"
+            if judgement.mark == "warn"
             else "find out why and fit a new session; a bad one can't be accepted"
         )
     )
@@ -484,8 +480,6 @@ _LIFE = (
     CalibrationRow.expires,
     CalibrationRow.revoked,
 )
-
-# --- history ----------------------------------------------------------------------------------------------------------
 
 
 def history(
@@ -523,15 +517,15 @@ def history(
         )
     if stated is not None:
         limits = CalibrationLimits.model_validate(stated)
-    one = _figure(rows[-1])
-    limit = next((found for found in (limits.limit if limits else ()) if found.concerns(one)), None)
+    newest = _figure(rows[-1])
+    limit = next((candidate for candidate in (limits.limit if limits else ()) if candidate.concerns(newest)), None)
     threshold = sigma_of_probability(sidak_part(false_alarm_rate, len(rows) - 1))
     return History(
         camera=camera,
         figure=figure,
         place=place,
         title=plain_name(figure, place),
-        unit=one.unit,
+        unit=newest.unit,
         limit=limit,
         false_alarm_rate=false_alarm_rate,
         threshold_sigma=threshold,
@@ -576,18 +570,16 @@ def _points(rows: Sequence[Any], limit: Limit | None, threshold_sigma: float) ->
 
 def _significance(a: Figure, b: Figure) -> float:
     """Of the difference of two figures in standard deviations, two-sided."""
-    one, two = (
+    first, two = (
         Numbers(figure.name, np.array([figure.value]), np.array([figure.std]), sensor=figure.sensor)
         for figure in (a, b)
     )
-    beside, std = two.beside(one)
-    difference = float(beside.value[0]) - a.value
+    at_same_temperature, std = two.beside(first)
+    difference = float(at_same_temperature.value[0]) - a.value
     if std[0] == 0.0:
         return 0.0 if difference == 0.0 else sigma_of_probability(0.0)
     return sigma_of_probability(2.0 * float(special.ndtr(-abs(difference) / std[0])))
 
-
-# --- the drift board --------------------------------------------------------------------------------------------------
 
 #: Calibrations that a board shows, the newest, unless it is told.
 BOARD_COLUMNS = 20
@@ -611,7 +603,7 @@ def drift_board(
     columns = _board_columns(store, camera, newest)
     if not columns:
         raise InputError(f"{camera[:100]}: no calibration of it is known; list the figures for the cameras' names")
-    ids = [one.id for one, _ in columns]
+    ids = [row.id for row, _ in columns]
     with store.reading() as db:
         asked = sa.select(*FigureRow.__table__.columns, CalibrationRow.session_id, *_LIFE)
         asked = asked.join(CalibrationRow, CalibrationRow.id == FigureRow.calibration_id)
@@ -620,8 +612,8 @@ def drift_board(
         for row in db.execute(asked.order_by(CalibrationRow.created, CalibrationRow.id, FigureRow.id)):
             rows.setdefault((row.name, row.place), []).append(row)
     if limits is None:
-        valid = [one for one, _ in columns if one.limits is not None and one.revoked is None]
-        stated = max(valid, key=lambda one: _aware(one.certified) or now()).limits if valid else None
+        valid = [row for row, _ in columns if row.limits is not None and row.revoked is None]
+        stated = max(valid, key=lambda row: _aware(row.certified) or now()).limits if valid else None
         limits = None if stated is None else CalibrationLimits.model_validate(stated)
     if reference_c is None:
         measured = [row.temperature_c for of in rows.values() for row in of if row.temperature_c is not None]
@@ -632,13 +624,13 @@ def drift_board(
         false_alarm_rate=false_alarm_rate,
         columns=tuple(
             BoardColumn(
-                calibration_id=one.id,
-                session_id=one.session_id,
-                name=name or one.session_id,
-                created=_aware(one.created) or at,
-                state=_state(one, at),
+                calibration_id=row.id,
+                session_id=row.session_id,
+                name=name or row.session_id,
+                created=_aware(row.created) or at,
+                state=_state(row, at),
             )
-            for one, name in columns
+            for row, name in columns
         ),
         rows=tuple(
             _board_row(rows[name, place], ids, limits, reference_c, false_alarm_rate)
@@ -664,11 +656,11 @@ def _board_columns(store: Store, camera: str, newest: int) -> list[tuple[Calibra
     and the newest of all that was certified."""
     has = sa.select(FigureRow.calibration_id).where(FigureRow.camera == camera)
     with store.reading() as db:
-        found = list(db.execute(_asked().where(CalibrationRow.id.in_(has)).order_by(CalibrationRow.created)))
-    certified = [one.id for one, _ in found if one.certified is not None and one.revoked is None]
-    last = {one.session_id: one.id for one, _ in found}
-    kept = [of for of in found if last[of[0].session_id] == of[0].id or of[0].certified is not None]
-    shown = {one.id for one, _ in kept[-newest:]} | set(certified[-1:])
+        rows = list(db.execute(_select_rows().where(CalibrationRow.id.in_(has)).order_by(CalibrationRow.created)))
+    certified = [row.id for row, _ in rows if row.certified is not None and row.revoked is None]
+    last = {row.session_id: row.id for row, _ in rows}
+    kept = [of for of in rows if last[of[0].session_id] == of[0].id or of[0].certified is not None]
+    shown = {row.id for row, _ in kept[-newest:]} | set(certified[-1:])
     return [of for of in kept if of[0].id in shown]
 
 
@@ -680,24 +672,24 @@ def _board_row(
     false_alarm_rate: float,
 ) -> BoardRow:
     """Return the board's row of one figure, of which `rows` has those calibrations that have it."""
-    one = _figure(rows[-1])
-    limit = next((found for found in (limits.limit if limits else ()) if found.concerns(one)), None)
+    figure = _figure(rows[-1])
+    limit = next((candidate for candidate in (limits.limit if limits else ()) if candidate.concerns(figure)), None)
     threshold = sigma_of_probability(sidak_part(false_alarm_rate, max(len(rows) - 1, 1)))
-    known = reference_c is not None and one.sensor is not None
+    known = reference_c is not None and figure.sensor is not None
     cells = {
         row.calibration_id: _cell(_figure(row), point, reference_c if known else None)
         for row, point in zip(rows, _points(rows, limit, threshold), strict=True)
     }
     return BoardRow(
-        group=_board_group(one.name),
-        figure=one.name,
-        place=one.place,
-        title=plain_name(one.name, one.place),
-        unit=one.unit,
+        group=_board_group(figure.name),
+        figure=figure.name,
+        place=figure.place,
+        title=plain_name(figure.name, figure.place),
+        unit=figure.unit,
         limit=limit,
         reference_c=reference_c if known else None,
-        law=f"doubles every {one.sensor.doubling_c:.1f} ± {one.sensor.doubling_c_std:.1f} °C"
-        if known and one.sensor is not None
+        law=f"doubles every {figure.sensor.doubling_c:.1f} ± {figure.sensor.doubling_c_std:.1f} °C"
+        if known and figure.sensor is not None
         else "",
         cells=tuple(cells.get(id) for id in ids),
     )
@@ -719,8 +711,6 @@ def _cell(figure: Figure, point: HistoryPoint, reference_c: float | None) -> Boa
         drifted=point.drifted,
     )
 
-
-# --- limits from the history ------------------------------------------------------------------------------------------
 
 #: Figures for which limits are drafted, by their names as a limit writes them, and which ends a drafted one has.
 DRAFTED: dict[str, Literal["both", "low", "high"]] = {
@@ -752,24 +742,24 @@ def drafted_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], tuple[str,
     judged. A draft says what is usual, not what a camera has to reach: somebody decides that."""
     wanted = calibration(store, id)
     rig = rig_of(wanted.cameras)
-    asked = _asked().where(CalibrationRow.rig == rig, CalibrationRow.revoked.is_(None))
+    asked = _select_rows().where(CalibrationRow.rig == rig, CalibrationRow.revoked.is_(None))
     with store.reading() as db:
-        known = [one for one, _ in db.execute(asked.order_by(CalibrationRow.created))]
-    last = {one.session_id: one.id for one in known}
+        known = [row for row, _ in db.execute(asked.order_by(CalibrationRow.created))]
+    last = {row.session_id: row.id for row in known}
     earlier = [
-        one.id for one in known if last[one.session_id] == one.id and (_aware(one.created) or now()) < wanted.created
+        row.id for row in known if last[row.session_id] == row.id and (_aware(row.created) or now()) < wanted.created
     ]
     ids = earlier[-DRAFTED_FROM:] if len(earlier) >= DRAFTED_LEAST else [*earlier, wanted.id]
     by_figure: dict[tuple[str, Side | None, str], list[Figure]] = {}
-    for one in ids:
-        for figure in figures(store, one):
+    for calibration_id in ids:
+        for figure in figures(store, calibration_id):
             pattern = next((name for name in DRAFTED if fnmatchcase(figure.name, name)), None)
             if pattern is not None and (pattern != "geometry camera_matrix" or figure.place in ("fx", "fy")):
                 by_figure.setdefault((figure.name, figure.side, figure.place), []).append(figure)
     drafted: dict[tuple[str, Side | None, str], tuple[float, float]] = {}
-    for (name, side, place), found in by_figure.items():
+    for (name, side, place), history in by_figure.items():
         pattern = next(of for of in DRAFTED if fnmatchcase(name, of))
-        low, high = _usual(found)
+        low, high = _usual(history)
         before = drafted.get((pattern, side, place))
         drafted[pattern, side, place] = (low, high) if before is None else (min(low, before[0]), max(high, before[1]))
     return tuple(
@@ -788,10 +778,10 @@ def drafted_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], tuple[str,
     ), tuple(ids)
 
 
-def _usual(found: Sequence[Figure]) -> tuple[float, float]:
+def _usual(history: Sequence[Figure]) -> tuple[float, float]:
     """Between which values the next one of an unchanged camera lies, with the interval in which it is judged."""
-    values = np.array([figure.value for figure in found])
-    std = math.sqrt(float(np.mean([figure.std**2 for figure in found])))
+    values = np.array([figure.value for figure in history])
+    std = math.sqrt(float(np.mean([figure.std**2 for figure in history])))
     n = values.size
     spread = max(float(values.std(ddof=1)) if n > 1 else 0.0, std)
     quantile = (

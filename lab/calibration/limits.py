@@ -63,7 +63,7 @@ class Figure(Frozen):
 
 def figures_of(fit: FitResult) -> tuple[Figure, ...]:
     """All figures of a fit, each once."""
-    found: list[Figure] = []
+    figures: list[Figure] = []
     models = [(side, camera, "") for side, camera in fit.cameras.items()]
     parts = [*models, (None, fit.stereo, "stereo ")] if fit.stereo is not None else models
     for side, model, prefix in parts:
@@ -73,12 +73,12 @@ def figures_of(fit: FitResult) -> tuple[Figure, ...]:
             for at, (value, std) in enumerate(zip(numbers.value.ravel(), numbers.std.ravel(), strict=True)):
                 if abs(value) < float("inf") and 0.0 <= std < float("inf"):
                     place = place_of(numbers, at)
-                    found.append(
+                    figures.append(
                         Figure(
                             name=name, side=side, place=place, value=float(value), std=float(std), sensor=numbers.sensor
                         )
                     )
-    return tuple(found)
+    return tuple(figures)
 
 
 Mark = Literal["good", "warn", "bad", "missing"]
@@ -176,10 +176,10 @@ class Judgement(Frozen):
 
 def judged(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judgement, ...]:
     """Every figure that a limit concerns, in the order of the limits."""
-    found: list[Judgement] = []
+    judgements: list[Judgement] = []
     for limit in limits.limit:
         concerned = [figure for figure in figures if limit.concerns(figure)]
-        found += [
+        judgements += [
             Judgement(
                 figure=figure.name,
                 title=figure.title,
@@ -194,7 +194,7 @@ def judged(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judg
             for figure in concerned
         ]
         if not concerned:
-            found.append(
+            judgements.append(
                 Judgement(
                     figure=limit.figure,
                     title=plain_name(limit.figure, limit.place),
@@ -207,7 +207,7 @@ def judged(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judg
                     mark="missing",
                 )
             )
-    return tuple(found)
+    return tuple(judgements)
 
 
 def standing_limits(folder: Path) -> CalibrationLimits | None:
@@ -223,5 +223,5 @@ def read_limits(file: Path) -> CalibrationLimits:
     try:
         return CalibrationLimits.model_validate(table)
     except ValidationError as error:
-        lines = [f"{file}: {'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
+        lines = [f"{file}: {'.'.join(map(str, problem['loc']))}: {problem['msg']}" for problem in error.errors()]
         raise InputError("\n".join(lines)) from error

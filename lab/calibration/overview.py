@@ -47,8 +47,10 @@ def tags_of(notes: str) -> tuple[str, ...]:
 def verdict_of(store: Store, diagnosis: str) -> DiagnosisVerdict:
     """Of a kept diagnosis, which never changes, and is long."""
     with store.reading() as db:
-        said = db.scalars(sa.select(ResultRow.document["verdict"].as_string()).where(ResultRow.id == diagnosis)).one()
-    return said
+        verdict = db.scalars(
+            sa.select(ResultRow.document["verdict"].as_string()).where(ResultRow.id == diagnosis)
+        ).one()
+    return verdict
 
 
 def _diagnoses(store: Store, sessions: Sequence[str] | None) -> dict[str, DiagnosisVerdict]:
@@ -62,7 +64,7 @@ def _diagnoses(store: Store, sessions: Sequence[str] | None) -> dict[str, Diagno
 
 def sessions_of_verdict(store: Store, verdict: DiagnosisVerdict) -> list[str]:
     """Ids of the sessions (and folders of recordings) whose newest diagnosis said this."""
-    return [source for source, said in _diagnoses(store, None).items() if said == verdict]
+    return [source for source, its_verdict in _diagnoses(store, None).items() if its_verdict == verdict]
 
 
 def overviews(store: Store, sessions: Sequence[str]) -> dict[str, SessionOverview]:
@@ -77,14 +79,14 @@ def overviews(store: Store, sessions: Sequence[str]) -> dict[str, SessionOvervie
         ids = [id for id, _ in newest.values()]
         figures = {name: _means(db, ids, patterns) for name, patterns in _SHOWN.items()}
     verdicts = _diagnoses(store, sessions)
-    found = {}
+    overviews = {}
     for session, station, runs in kept:
-        id, cameras = newest.get(session, (None, _reported(runs)))
+        id, cameras = newest.get(session, (None, _list_reported(runs)))
         shown: dict[str, Any] = {name: of.get(id or "", {}) for name, of in figures.items()}
-        found[session] = SessionOverview(
+        overviews[session] = SessionOverview(
             station=station or "", cameras=cameras, calibration_id=id, verdict=verdicts.get(session), **shown
         )
-    return found
+    return overviews
 
 
 def _means(db: Any, calibrations: Sequence[str], patterns: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -92,13 +94,13 @@ def _means(db: Any, calibrations: Sequence[str], patterns: Sequence[str]) -> dic
     asked = sa.select(FigureRow.calibration_id, FigureRow.side, sa.func.avg(FigureRow.value))
     asked = asked.where(FigureRow.calibration_id.in_(calibrations), FigureRow.side.is_not(None))
     asked = asked.where(sa.or_(*(FigureRow.name.like(pattern) for pattern in patterns)))
-    found: dict[str, dict[str, float]] = defaultdict(dict)
+    figures: dict[str, dict[str, float]] = defaultdict(dict)
     for id, side, mean in db.execute(asked.group_by(FigureRow.calibration_id, FigureRow.side)):
-        found[id][side] = mean
-    return found
+        figures[id][side] = mean
+    return figures
 
 
-def _reported(runs: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+def _list_reported(runs: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Return the cameras of a session's last run as they reported themselves, by side."""
     instruments: Mapping[str, Mapping[str, str]] = runs[-1]["instruments"] if runs else {}
     return {

@@ -139,7 +139,7 @@ def _check_mark(root: Path, target: Path) -> None:
     """Mark an empty folder as this data folder's backup. Raises InputError for a folder that holds anything else."""
     mark = target / MARK
     if not mark.exists():
-        if any(one.name != "lost+found" for one in target.iterdir()):
+        if any(entry.name != "lost+found" for entry in target.iterdir()):
             raise InputError(f"{target}: isn't empty and no backup; name a folder of its own")
         mark.write_text(f"{root}\n")
     elif mark.read_text().strip() != str(root):
@@ -159,10 +159,10 @@ def _adopt_single_copy(root: Path, target: Path) -> None:
         linked = _linked_files(registry)
         files = {}
         for path in _files(moved):
-            found = FileSum(sha256=sha256_of(moved / path), bytes=(moved / path).stat().st_size)
+            moved_sum = FileSum(sha256=sha256_of(moved / path), bytes=(moved / path).stat().st_size)
             expected = linked.files.get(str(path))
-            if expected is None or expected == found:
-                files[str(path)] = found
+            if expected is None or expected == moved_sum:
+                files[str(path)] = moved_sum
         files[REGISTRY] = FileSum(sha256=sha256_of(registry), bytes=registry.stat().st_size)
         made = datetime.fromtimestamp(registry.stat().st_mtime, UTC)
         _write_record(moved, root, linked, files, known_version=False)
@@ -325,9 +325,9 @@ class _Writer:
                 files[path] = taken
         for path in (*linked.files, *linked.packs):
             if path not in files and path not in self.damaged:
-                found = self._carry_forward(path, linked.files.get(path), before, "missing in the data folder")
-                if found is not None:
-                    files[path] = found
+                carried = self._carry_forward(path, linked.files.get(path), before, "missing in the data folder")
+                if carried is not None:
+                    files[path] = carried
         return files
 
     def _take(self, path: str, linked: _LinkedFiles, before: list[Generation]) -> FileSum | None:
@@ -352,26 +352,26 @@ class _Writer:
                 return expected
         partial = made.with_name(f".{made.name}.partial")
         try:
-            found = copy_hashed(source, partial)
+            copied = copy_hashed(source, partial)
         except FileNotFoundError:
             return None
         why = None
         if expected is not None:
-            why = _difference(found, expected)
-        elif found != known and path in linked.packs:
+            why = _difference(copied, expected)
+        elif copied != known and path in linked.packs:
             why = _damaged_pack(partial, linked.packs[path])
-        elif found != known and known is not None:
-            why = _suspicion(path, partial, found, known)
+        elif copied != known and known is not None:
+            why = _suspicion(path, partial, copied, known)
         if why is not None:
             partial.unlink()
             return self._carry_forward(path, expected or known, before, why)
-        if known == found and not before[0].damage(path):
+        if known == copied and not before[0].damage(path):
             partial.unlink()
             link_or_copy(before[0].folder / path, made)
-            return found
+            return copied
         partial.rename(made)
-        self.copied, self.copied_bytes = self.copied + 1, self.copied_bytes + found.bytes
-        return found
+        self.copied, self.copied_bytes = self.copied + 1, self.copied_bytes + copied.bytes
+        return copied
 
     def _newest_sum(self, path: str, before: list[Generation]) -> FileSum | None:
         return before[0].sum_of(path) if before else None
@@ -391,7 +391,10 @@ class _Writer:
             return recorded
         self.lost.add(path)
         frames = f"{path.removesuffix(PACK)}frames/"
-        unpacked = next((one.name for one in before if any(file.startswith(frames) for file in _paths(one))), None)
+        unpacked = next(
+            (generation.name for generation in before if any(file.startswith(frames) for file in _paths(generation))),
+            None,
+        )
         if path.endswith(f"/{PACK}") and unpacked is not None:
             self.damaged[path] = (
                 f"{why}; the generation {unpacked} has its frames of before they were packed: calibench restore "
@@ -409,7 +412,7 @@ class _Writer:
         gone: dict[str, int] = {}
         for path in _paths(before[0]):
             parts = path.split("/")
-            if path in files or path in self.damaged or path.startswith(tuple(f"{one}frames/" for one in packed)):
+            if path in files or path in self.damaged or path.startswith(tuple(f"{folder}frames/" for folder in packed)):
                 continue
             name = "/".join(parts[:2])
             gone[name] = gone.get(name, 0) + 1
@@ -419,19 +422,19 @@ class _Writer:
         return tuple(f"{line}; the generation {before[0].name} has what it was, if nobody deleted it" for line in lines)
 
 
-def _difference(found: FileSum, expected: FileSum) -> str | None:
+def _difference(actual: FileSum, expected: FileSum) -> str | None:
     """Return how a copy differs from what the registry has; None where it doesn't."""
-    if found == expected:
+    if actual == expected:
         return None
-    if found.bytes != expected.bytes:
-        return f"damaged in the data folder: {found.bytes} bytes, the registry has {expected.bytes}"
-    return f"damaged in the data folder: its SHA-256 is {found.sha256[:12]}, the registry has {expected.sha256[:12]}"
+    if actual.bytes != expected.bytes:
+        return f"damaged in the data folder: {actual.bytes} bytes, the registry has {expected.bytes}"
+    return f"damaged in the data folder: its SHA-256 is {actual.sha256[:12]}, the registry has {expected.sha256[:12]}"
 
 
-def _suspicion(path: str, copy: Path, found: FileSum, known: FileSum) -> str | None:
+def _suspicion(path: str, copy: Path, actual: FileSum, known: FileSum) -> str | None:
     """Return why a file that the registry doesn't name, and that changed since the newest generation, is damaged; None
     where nothing indicates that it is."""
-    if found.bytes == 0:
+    if actual.bytes == 0:
         return f"empty in the data folder, {known.bytes} bytes before"
     if path.partition("/")[0] in _FIXED:
         return "changed in the data folder, where such files never change"
@@ -464,8 +467,8 @@ def _record_or_none(generation: Generation) -> GenerationRecord | None:
     return None
 
 
-def _same_size_and_time(one: Path, other: Path) -> bool:
-    a, b = one.lstat(), other.lstat()
+def _same_size_and_time(file: Path, other: Path) -> bool:
+    a, b = file.lstat(), other.lstat()
     return (a.st_size, a.st_mtime_ns) == (b.st_size, b.st_mtime_ns)
 
 

@@ -78,7 +78,7 @@ class ByHand:
         kind = self.kind_of(name)
         usual = usual_of(kind, self._station)
         left = left_by_session(self._root, self._session)
-        others = () if left is None else tuple(one for one in left.changes if one.changes != kind.changes)
+        others = () if left is None else tuple(change for change in left.changes if change.changes != kind.changes)
         if is_confirmed and name == usual:
             _keep(self._root, self._session, self._station.addresses, others)
             return
@@ -89,7 +89,7 @@ class ByHand:
     def check_can_put_back(self) -> None:
         """Raise InputError where this station can't ask for what other sessions left changed to be put back."""
         for left in self.left_by_others():
-            if self._station.lacks("stage") or any(one.back not in self._station.targets for one in left.changes):
+            if self._station.lacks("stage") or any(change.back not in self._station.targets for change in left.changes):
                 raise InputError(
                     f"session {left.session}: {left.words}; the station has no [stage] or target to ask for it: put it "
                     f"back, then say so with `calibench put-back {left.session}`"
@@ -97,7 +97,7 @@ class ByHand:
 
     def left_by_others(self) -> tuple[LeftByHand, ...]:
         """Return what other sessions left changed on these instruments."""
-        return tuple(one for one in left_by_hand(self._root, self._station) if one.session != self._session)
+        return tuple(left for left in left_by_hand(self._root, self._station) if left.session != self._session)
 
 
 def _keep(root: Path, session: str, addresses: Iterable[str], changes: tuple[HandChange, ...]) -> None:
@@ -141,5 +141,5 @@ def note_put_back(root: Path, session: str, changes: str | None = None) -> None:
     """Note that what a session left changed is put back: all, or the thing `changes`."""
     left = left_by_session(root, session)
     if left is not None:
-        rest = tuple(one for one in left.changes if changes not in (None, one.changes))
+        rest = tuple(change for change in left.changes if changes not in (None, change.changes))
         _keep(root, session, left.addresses, rest)

@@ -89,7 +89,7 @@ def _described(kind: type[Sequence]) -> SequenceDescription:
     return SequenceDescription(
         name=kind.name,
         purpose=kind.purpose,
-        capture_kinds=tuple(name for name, one in CAPTURES.models.items() if one.sequence is kind),
+        capture_kinds=tuple(name for name, model in CAPTURES.models.items() if model.sequence is kind),
         instruments=kind.instruments,
         targets=tuple(get_args(target.model_fields["kind"].annotation)[0] for target in kind.targets),
         parameters=tuple(
@@ -108,24 +108,22 @@ def _described(kind: type[Sequence]) -> SequenceDescription:
 
 def parse_parameters(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Parameters from texts like `narrowband.step_nm=5` or `dark.exposures_s=0.01,0.1,1`. Raises InputError."""
-    found: dict[str, dict[str, Any]] = defaultdict(dict)
+    parameters: dict[str, dict[str, Any]] = defaultdict(dict)
     for text in texts:
         name, _, value = text.partition("=")
         sequence, _, parameter = name.strip().partition(".")
         if sequence not in SEQUENCES or not parameter or not value:
             raise InputError(f"{text!r}: give SEQUENCE.PARAMETER=VALUE, of a sequence of {', '.join(SEQUENCES)}")
-        several = {one.name for one in described(sequence).parameters if one.several}
+        several = {parameter.name for parameter in described(sequence).parameters if parameter.several}
         try:
             numbers = [float(part) for part in value.split(",")]
         except ValueError:
             raise InputError(
                 f"{text!r}: {value!r} isn't a number, nor several with commas between; give that"
             ) from None
-        found[sequence][parameter] = numbers if parameter in several or len(numbers) > 1 else numbers[0]
-    return dict(found)
+        parameters[sequence][parameter] = numbers if parameter in several or len(numbers) > 1 else numbers[0]
+    return dict(parameters)
 
-
-# --- the time ---------------------------------------------------------------------------------------------------------
 
 #: A step's sequence, and what it does.
 Work = tuple[str, tuple[str, ...]]
@@ -221,7 +219,7 @@ def estimate(plan: CapturePlan, station: Station, times: StepTimes) -> PlanEstim
         )
     return PlanEstimate(
         sequences=tuple(planned),
-        steps=sum(one.steps for one in planned),
-        captures=sum(one.captures for one in planned),
-        estimated_s=round(sum(one.estimated_s for one in planned), 1),
+        steps=sum(sequence.steps for sequence in planned),
+        captures=sum(sequence.captures for sequence in planned),
+        estimated_s=round(sum(sequence.estimated_s for sequence in planned), 1),
     )

@@ -294,10 +294,10 @@ class LampDevice(Device):
     def _check_still_lit(self) -> None:
         """Raise InstrumentError where a channel isn't as it was set: somebody's hand may have switched it off."""
         for channel, share in self.levels.items():
-            if (found := self.light_source.level(channel)) != share:
+            if (level := self.light_source.level(channel)) != share:
                 self.value = None
                 raise InstrumentError(
-                    f"light source: channel {channel} was set to {share:g} and is at {found:g} now; look who switches "
+                    f"light source: channel {channel} was set to {share:g} and is at {level:g} now; look who switches "
                     "it, and resume"
                 )
 
@@ -413,11 +413,11 @@ class PhotodiodeDevice(Device):
         return Status("photodiode", measure, MEASURE_S)
 
     def readings(self) -> dict[str, float | str]:
-        found = self.measured
+        measured = self.measured
         return {
-            "irradiance_w_m2": found.irradiance_w_m2 if found else 0.0,
-            "sd_irradiance_w_m2": found.sd_irradiance_w_m2 if found else 0.0,
-            "irradiance_calibration_sd_percent": 100.0 * found.calibration_sd if found else 0.0,
+            "irradiance_w_m2": measured.irradiance_w_m2 if measured else 0.0,
+            "sd_irradiance_w_m2": measured.sd_irradiance_w_m2 if measured else 0.0,
+            "irradiance_calibration_sd_percent": 100.0 * measured.calibration_sd if measured else 0.0,
             "photodiode_dark_a": self.dark_a or 0.0,
         }
 
@@ -563,9 +563,9 @@ class CamerasDevice(Device):
             stored = None if path is None else self.write(path, side, raw)
             return level_of(raw, self.sheets[side]), stored
 
-        found = {side: in_thread(partial(kept, side)) for side in frames}
-        wait(found.values())  # where one can't be written, the other's isn't written on while the step is taken again
-        results = {side: future.result() for side, future in found.items()}
+        written = {side: in_thread(partial(kept, side)) for side in frames}
+        wait(written.values())  # where one can't be written, the other's isn't written on while the step is taken again
+        results = {side: future.result() for side, future in written.items()}
         self.levels = {side: level for side, (level, _) in results.items()}
         self.stored = {side: stored for side, (_, stored) in results.items() if stored is not None}
 
@@ -581,9 +581,9 @@ class CamerasDevice(Device):
             await bounded(f"camera {side}", camera.stop)
 
     def readings(self) -> dict[str, float | str]:
-        found: dict[str, float | str] = {}
+        readings: dict[str, float | str] = {}
         for side in self.cameras:
-            found[f"{side}_exposure_s"] = self.frames[side].exposure_s if side in self.frames else 0.0
-            found[f"{side}_level"] = self.levels[side]
-            found[f"{side}_frame"] = self.stored[side].path if side in self.stored else ""
-        return found
+            readings[f"{side}_exposure_s"] = self.frames[side].exposure_s if side in self.frames else 0.0
+            readings[f"{side}_level"] = self.levels[side]
+            readings[f"{side}_frame"] = self.stored[side].path if side in self.stored else ""
+        return readings

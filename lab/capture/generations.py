@@ -92,18 +92,18 @@ class Generation:
         """Read a file; return what is wrong with it, None where it has the recorded SHA-256."""
         recorded = self.record.files[path]
         try:
-            found = sha256_of(self.folder / path)
+            actual = sha256_of(self.folder / path)
         except OSError as error:
             return f"can't be read ({error.strerror})"
-        if found == recorded.sha256 or (path == REGISTRY and is_intact_registry(self.folder / path)):
+        if actual == recorded.sha256 or (path == REGISTRY and is_intact_registry(self.folder / path)):
             return None
-        return f"damaged: its SHA-256 is {found[:12]}, recorded is {recorded.sha256[:12]}"
+        return f"damaged: its SHA-256 is {actual[:12]}, recorded is {recorded.sha256[:12]}"
 
 
 def generations_of(backup: Path) -> list[Generation]:
     """Return the generations of a backup, the newest first."""
-    found = [one.parent for one in backup.glob(f"[0-9]*/{RECORD}")]
-    return [Generation(folder) for folder in sorted(found, key=lambda folder: folder.name, reverse=True)]
+    folders = [record_file.parent for record_file in backup.glob(f"[0-9]*/{RECORD}")]
+    return [Generation(folder) for folder in sorted(folders, key=lambda folder: folder.name, reverse=True)]
 
 
 def lock_of(backup: Path) -> Lock:

@@ -143,19 +143,19 @@ class Instruments:
 
         Raises DeviceError where an instrument doesn't answer, and where a camera's pixels or colour filters contradict
         its data sheet."""
-        found: dict[str, InstrumentSnapshot] = {}
+        snapshots: dict[str, InstrumentSnapshot] = {}
         for name, driver in self.drivers.all.items():
             go_on()
             try:
                 driver.connect()
                 driver.stop()
-                found[name] = _snapshot(driver)
+                snapshots[name] = _snapshot(driver)
             except InstrumentError as error:
                 raise DeviceError(named_complaint(name, error)) from error
         for side, camera in self.drivers.cameras.items():
-            if (said := contradiction(side, camera.sensor(), self.station.cameras[side].datasheet)) is not None:
-                raise DeviceError(said)
-        return found
+            if (difference := contradiction(side, camera.sensor(), self.station.cameras[side].datasheet)) is not None:
+                raise DeviceError(difference)
+        return snapshots
 
     def check(self, steps: Sequence[Step]) -> None:
         """Raise DeviceError for what these steps need and an instrument can't do; nothing moves, and nothing is
@@ -208,18 +208,18 @@ class Instruments:
     def _exposures(self, steps: Sequence[Step]) -> Iterable[tuple[str, float, float]]:
         """Return every exposure (s) and gain (dB) of a plan, and in words where they come from."""
         limits = self.limits
-        found: dict[tuple[str, float, float], None] = {}
+        lights: dict[tuple[str, float, float], None] = {}
         for step in steps:
             own_db = step.setting.gain_db
             gain_db = limits.gain_db if own_db is None else own_db
             gain = "gain_db under [limits] of the station file" if own_db is None else f"a gain of {own_db:g} dB"
             if isinstance(step.exposure, FixedExposure):
-                found[f"the sequence {step.sequence} needs it, with {gain}", step.exposure.exposure_s, gain_db] = None
+                lights[f"the sequence {step.sequence} needs it, with {gain}", step.exposure.exposure_s, gain_db] = None
             elif step.exposure is not None:
                 for key, exposure_s in (("min", limits.exposure_min_s), ("max", limits.exposure_max_s)):
                     whence = f"exposure_{key}_s and {gain} allow it: correct them"
-                    found[whence, exposure_s, gain_db] = None
-        return found
+                    lights[whence, exposure_s, gain_db] = None
+        return lights
 
     def _check_screen(self, target: str) -> None:
         """Raise DeviceError where the display's screen isn't as large as the station file has it: something scales its
@@ -228,13 +228,13 @@ class Instruments:
         if self.screen is None or wanted is None:
             return
         try:
-            found = self.screen.display.screen_px()
+            shown_px = self.screen.display.screen_px()
         except InstrumentError as error:
             raise DeviceError(named_complaint("display", error)) from error
-        if found != wanted:
+        if shown_px != wanted:
             raise DeviceError(
-                f"display: its screen has {found[0]} x {found[1]} px, [targets.{target}] in the station file says "
-                f"{wanted[0]} x {wanted[1]}: "
+                f"display: its screen has {shown_px[0]} x {shown_px[1]} px, [targets.{target}] in the station file "
+                f"says {wanted[0]} x {wanted[1]}: "
                 "the system scales its pixels, or it is another screen; set its scaling to 100 %, or correct rows and "
                 "cols there"
             )
@@ -259,7 +259,8 @@ def _snapshot(driver: Instrument) -> InstrumentSnapshot:
 
     def told(values: Mapping[str, Setting]) -> dict[str, Setting]:
         return {
-            key: str(one) if isinstance(one, float) and not math.isfinite(one) else one for key, one in values.items()
+            key: str(setting) if isinstance(setting, float) and not math.isfinite(setting) else setting
+            for key, setting in values.items()
         }
 
     return InstrumentSnapshot(

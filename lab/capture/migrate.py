@@ -45,12 +45,12 @@ def _migrate(engine: sa.Engine, folder: Path) -> None:
         raise InputError(f"{folder}: its registry is being migrated by another process; try again when it is done")
     try:
         with engine.execution_options(writes=True).connect() as connection:
-            found = MigrationContext.configure(connection).get_current_revision()
-            if found == newest:
+            revision = MigrationContext.configure(connection).get_current_revision()
+            if revision == newest:
                 return
-            if found is not None and found not in known:
+            if revision is not None and revision not in known:
                 raise InputError(
-                    f"{folder}: its registry has the revision {found}, written by a newer calibench; install that "
+                    f"{folder}: its registry has the revision {revision}, written by a newer calibench; install that "
                     "version, or restore "
                     "the backup of before the upgrade"
                 )

@@ -34,7 +34,7 @@ class CapturePlan:
         """All steps. What a hand puts back only to change it again at once stays as it is. Raises InputError if the
         station lacks what one of them needs, and where a step is there twice."""
         every = [step for sequence in self.sequences for step in sequence.steps(station)]
-        kinds = {name: type(one) for name, one in station.list_targets(Adjustment).items()}
+        kinds = {name: type(target) for name, target in station.list_targets(Adjustment).items()}
         made = tuple(
             step
             for step, following in zip(every, [*every[1:], None], strict=True)
@@ -61,10 +61,10 @@ class CapturePlan:
     def document(self) -> dict[str, Any]:
         """Return the sequences' parameters by name, as JSON; a list of them where a sequence is taken in several
         lights."""
-        found: dict[str, list[Any]] = {}
+        by_name: dict[str, list[Any]] = {}
         for sequence in self.sequences:
-            found.setdefault(sequence.name, []).append(sequence.model_dump(mode="json", exclude_none=True))
-        return {name: taken[0] if len(taken) == 1 else taken for name, taken in found.items()}
+            by_name.setdefault(sequence.name, []).append(sequence.model_dump(mode="json", exclude_none=True))
+        return {name: taken[0] if len(taken) == 1 else taken for name, taken in by_name.items()}
 
 
 def _is_changed_again(step: Step, following: Step, kinds: Mapping[str, type[Adjustment]]) -> bool:
@@ -86,9 +86,8 @@ def full_plan(
     taken = possible if only is None else _only(possible, only)
     wanted = parameters or {}
     if idle := wanted.keys() - {sequence.name for sequence in taken}:
-        raise InputError(
-            f"parameters: {', '.join(sorted(idle))} isn't taken; name some of {', '.join(one.name for one in taken)}"
-        )
+        names = ", ".join(sequence.name for sequence in taken)
+        raise InputError(f"parameters: {', '.join(sorted(idle))} isn't taken; name some of {names}")
     return CapturePlan(tuple(_with(sequence, wanted.get(sequence.name, {})) for sequence in taken))
 
 
@@ -110,13 +109,13 @@ def standards_plan(station: Equipment, quick: bool = False) -> CapturePlan:
     beyond = (1.15, 1.5, 2.2, 3.2, 4.5)
     below = (round(float(level), 4) for level in np.linspace(0.02, 0.98, count - len(beyond)))
     levels = (*below, *beyond, *(0.5,) * (STACK_IMAGES // frames))
-    own: dict[str, dict[str, Any]] = {
+    stated: dict[str, dict[str, Any]] = {
         "flat": {"levels": levels, "frames": frames},
         "dark": {"frames": STACK_IMAGES},
     }
-    found = [_with(sequence, own.get(sequence.name, {})) for sequence in taken]
+    sequences = [_with(sequence, stated.get(sequence.name, {})) for sequence in taken]
     return CapturePlan(
-        (*found, *((FlareSequence(frames=2 if quick else 4),) if FlareSequence.possible(station) else ()))
+        (*sequences, *((FlareSequence(frames=2 if quick else 4),) if FlareSequence.possible(station) else ()))
     )
 
 

@@ -113,7 +113,7 @@ def plan_devices(
         return write("spectrum", path, format_spectrum(spectrum).encode())
 
     drivers = connect(station)
-    found = Instruments(
+    instruments = Instruments(
         station,
         drivers,
         write_frame=write_frame,
@@ -122,22 +122,22 @@ def plan_devices(
         by_hand=ByHand(folder, "plan", station),
     )
     try:
-        there = found.connect()
+        there = instruments.connect()
         sheets = {side: camera.datasheet for side, camera in station.cameras.items()}
         radiometer = drivers.spectroradiometer
         yield PlanDevices(
             cameras=PlanCameras(drivers.cameras, sheets, write_frame),
             instruments=there,
-            target=found.target,
-            light=found.light,
-            shutter=found.shutter,
-            screen=found.screen,
+            target=instruments.target,
+            light=instruments.light,
+            shutter=instruments.shutter,
+            screen=instruments.screen,
             radiometer=PlanRadiometer(radiometer, write_spectrum) if radiometer else None,
-            photodiode=found.photodiode,
-            lamp=found.lamp,
+            photodiode=instruments.photodiode,
+            lamp=instruments.lamp,
         )
     finally:
-        safe = found.make_safe()
-        found.close()
+        safe = instruments.make_safe()
+        instruments.close()
         if safe.complaints:
             raise DeviceError(f"not brought into a safe state: {'; '.join(safe.complaints)}")

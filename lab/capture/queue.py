@@ -80,28 +80,28 @@ def expected_times(
 
     `addresses`, `duration_s`: of each session. `busy_until`: of the instruments in use now, by address; None: not
     known. A session that is held, or waits for an instrument of which that isn't known, isn't in the answer."""
-    found: dict[str, tuple[datetime, datetime]] = {}
+    times: dict[str, tuple[datetime, datetime]] = {}
     until = dict(busy_until)
     moments = [at]
     while moments:
         at = moments.pop(0)
         taken = {address for address, end in until.items() if end is None or end > at}
-        for one in waiting:
-            if one.id in found:
+        for queued in waiting:
+            if queued.id in times:
                 continue
-            mine = addresses[one.id]
-            if one.held is None and (one.not_before is None or one.not_before <= at) and not mine & taken:
-                end = at + timedelta(seconds=duration_s[one.id])
-                found[one.id] = (at, end)
+            mine = addresses[queued.id]
+            if queued.held is None and (queued.not_before is None or queued.not_before <= at) and not mine & taken:
+                end = at + timedelta(seconds=duration_s[queued.id])
+                times[queued.id] = (at, end)
                 until |= dict.fromkeys(mine, end)
                 taken |= mine
-            elif one.not_before is None or one.held is not None:
+            elif queued.not_before is None or queued.held is not None:
                 taken |= mine  # who comes later on these instruments waits for it
-        left = [one for one in waiting if one.id not in found]
+        left = [queued for queued in waiting if queued.id not in times]
         later = {end for end in until.values() if end is not None and end > at}
-        later |= {one.not_before for one in left if one.not_before is not None and one.not_before > at}
+        later |= {queued.not_before for queued in left if queued.not_before is not None and queued.not_before > at}
         moments = sorted(later)[:1]
-    return found
+    return times
 
 
 def leave_queue(store: Store, session_id: str) -> None:

@@ -49,14 +49,14 @@ def make_station_safe(
             on_shut()
         driver.connect()
 
-    found, until = made_safe(drivers, reached, on_shut), time.monotonic() + STOP_S
+    states, until = made_safe(drivers, reached, on_shut), time.monotonic() + STOP_S
     closing = [in_thread(driver.close) for driver in drivers.all.values()]
     for done in closing:
         try:
             done.result(max(0.0, until - time.monotonic()))
         except Exception:
             log.debug("a connection wasn't closed", exc_info=True)
-    return found
+    return states
 
 
 def ended_without_progress_twice(store: Store, session_id: str) -> bool:
@@ -174,12 +174,12 @@ class Recovery:
                 _, pause_s = self._next_try_s.get(session_id, (0.0, LOOK_S / 2))
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
                 self._next_try_s[session_id] = (self._clock() + pause_s, pause_s)
-                said = (
+                message = (
                     f"{began}; not brought into a safe state: {'; '.join(complaints)}; look after them, they are "
                     "tried again"
                 )
-                self._store.set_state(session_id, "running", error=said)  # so that the next look finds it
-                log.error("session %s: %s", session_id, said)
+                self._store.set_state(session_id, "running", error=message)  # so that the next look finds it
+                log.error("session %s: %s", session_id, message)
                 return
             self._safe_since.setdefault(session_id, safe)
             self._next_try_s.pop(session_id, None)

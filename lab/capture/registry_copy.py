@@ -48,7 +48,7 @@ def _copy_sqlite(registry: Path, made: Path) -> None:
         with contextlib.closing(sqlite3.connect(registry, timeout=30.0)) as source:
             source.execute("VACUUM INTO ?", (str(made),))
         with contextlib.closing(sqlite3.connect(made)) as copy:
-            found = [row[0] for row in copy.execute("PRAGMA quick_check")]
+            problems = [row[0] for row in copy.execute("PRAGMA quick_check")]
             copy.execute("PRAGMA journal_mode=WAL")  # as a data folder's is, so that opening it changes no byte
     except sqlite3.DatabaseError as error:
         if "full" in str(error) or "locked" in str(error):
@@ -56,9 +56,9 @@ def _copy_sqlite(registry: Path, made: Path) -> None:
         raise InputError(
             f"{registry}: damaged ({error}); stop the service, and bring a generation back: calibench restore"
         ) from error
-    if found != ["ok"]:
+    if problems != ["ok"]:
         raise InputError(
-            f"{registry}: damaged ({found[0]}); stop the service, and bring a generation back: calibench restore"
+            f"{registry}: damaged ({problems[0]}); stop the service, and bring a generation back: calibench restore"
         )
 
 

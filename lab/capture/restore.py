@@ -56,10 +56,10 @@ class RestoreReport:
 
 def list_generations(backup: Path) -> list[Generation]:
     """Return the generations of a backup, the newest first. Raises InputError where there is none."""
-    found = generations_of(backup)
-    if not found:
+    generations = generations_of(backup)
+    if not generations:
         raise InputError(f"{backup}: holds no generation of a backup; name the folder that `calibench backup` wrote")
-    return found
+    return generations
 
 
 def restore(
@@ -90,7 +90,7 @@ def restore(
             if not (target / SWAPPING).exists():
                 _stage(chosen, target, advance)
             elif not (target / STAGED / chosen.name).is_dir():
-                (staged,) = (one.name for one in (target / STAGED).iterdir() if one.is_dir())
+                (staged,) = (entry.name for entry in (target / STAGED).iterdir() if entry.is_dir())
                 raise InputError(f"{target}: {staged} is half in its place; restore that first (--generation {staged})")
             before = _swap(target, settings)
         finally:
@@ -102,7 +102,7 @@ def restore(
             "changed, then restore again: it continues"
         ) from error
     files = chosen.record.files
-    return RestoreReport(chosen.name, len(files), sum(one.bytes for one in files.values()), before, remarks)
+    return RestoreReport(chosen.name, len(files), sum(file.bytes for file in files.values()), before, remarks)
 
 
 @dataclass(frozen=True)
@@ -131,11 +131,11 @@ def repair(backup: Path, store: Store, advance: Advance = lambda text, share: No
         if why is None or ("/frames/" in path and (file.parents[1] / PACK).exists()):  # packed meanwhile
             continue
         made = file.with_name(f".{file.name}.partial")
-        for one in generations:
-            recorded = one.sum_of(path)
-            if recorded is None or (expected is not None and recorded.sha256 != expected) or one.damage(path):
+        for generation in generations:
+            recorded = generation.sum_of(path)
+            if recorded is None or (expected is not None and recorded.sha256 != expected) or generation.damage(path):
                 continue
-            copied = copy_hashed(one.folder / path, made)
+            copied = copy_hashed(generation.folder / path, made)
             if copied != recorded:
                 made.unlink()
                 continue
@@ -186,10 +186,12 @@ def _chosen(backup: Path, name: str | None) -> Generation:
     known = list_generations(backup)
     if name is None:
         return known[0]
-    for one in known:
-        if one.name == name:
-            return one
-    raise InputError(f"{backup}: has no generation {name!r}; choose from {', '.join(one.name for one in known)}")
+    for generation in known:
+        if generation.name == name:
+            return generation
+    raise InputError(
+        f"{backup}: has no generation {name!r}; choose from {', '.join(generation.name for generation in known)}"
+    )
 
 
 def _check_version(generation: Generation) -> tuple[str, ...]:
@@ -219,7 +221,7 @@ def _check_free_to_write(target: Path, settings: Settings, replace: bool) -> Non
             raise InputError(f"{target}: a process works with it; stop the service and end what captures")
     if (target / SWAPPING).exists() or replace:
         return
-    if present := [one.name for one in _entries(target)]:
+    if present := [entry.name for entry in _entries(target)]:
         raise InputError(
             f"{target}: isn't empty (it has {', '.join(sorted(present)[:3])}); give --replace, which moves this "
             f"to {_BEFORE}TIME in it, or another folder by --to"
@@ -233,7 +235,7 @@ def _check_free_to_write(target: Path, settings: Settings, replace: bool) -> Non
 
 def _entries(target: Path) -> list[Path]:
     """What a data folder holds, without what belongs to restoring."""
-    return [one for one in target.iterdir() if one.name not in _STAYS and not one.name.startswith(_BEFORE)]
+    return [entry for entry in target.iterdir() if entry.name not in _STAYS and not entry.name.startswith(_BEFORE)]
 
 
 def _stage(generation: Generation, target: Path, advance: Advance) -> None:
@@ -288,7 +290,7 @@ def _swap(target: Path, settings: Settings) -> Path | None:
         swapping.touch()
         sync_folder(staging)
     before = target / (staging / ".before").read_text()
-    (folder,) = (one for one in staging.iterdir() if one.is_dir())
+    (folder,) = (entry for entry in staging.iterdir() if entry.is_dir())
     moved = staging / ".moved"
     if not moved.exists():
         for entry in _entries(target):

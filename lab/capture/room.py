@@ -65,9 +65,9 @@ def _full(folder: Path, free_bytes: int, wanted_bytes: int, make_room: str) -> s
 
 
 def _free_bytes(folder: Path) -> int:
-    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
-    found = os.statvfs(there)
-    return found.f_frsize * (found.f_bfree if os.geteuid() == 0 else found.f_bavail)
+    existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
+    disk = os.statvfs(existing)
+    return disk.f_frsize * (disk.f_bfree if os.geteuid() == 0 else disk.f_bavail)
 
 
 def _owner(place: Path) -> str:

@@ -80,8 +80,8 @@ class _Station:
     def _entries(self, *families: str) -> Iterator[tuple[str, dict[str, Any]]]:
         """(family, table) of its instruments. Those without an address are people, whom nothing stops."""
         for family in families:
-            found = self._document.get(family) or {}
-            every = [("camera", one) for one in found.values()] if family == "cameras" else [(family, found)]
+            table = self._document.get(family) or {}
+            every = [("camera", camera) for camera in table.values()] if family == "cameras" else [(family, table)]
             yield from ((name, entry) for name, entry in every if entry.get("address"))
 
     def _start(self, work: Callable[[Any], None], of: object) -> None:
@@ -94,23 +94,23 @@ class _Station:
             monochromator = driver("monochromator", entry["driver"])(entry["address"], **_settings(entry))
             if monochromator.shut_at_once():
                 self.shutter_asked.set()
-            said = f"session {self.session_id}: its process ended without a word; its shutter was closed"
-            self._stop(monochromator, said)
+            message = f"session {self.session_id}: its process ended without a word; its shutter was closed"
+            self._stop(monochromator, message)
         except Exception:
             log.debug("session %s: its shutter wasn't closed", self.session_id, exc_info=True)
         finally:
             self.shutter_asked.set()
 
-    def _stop(self, instrument: Any, said: str = "") -> None:
+    def _stop(self, instrument: Any, message: str = "") -> None:
         try:
             with contextlib.ExitStack() as whatever_the_disk_does:
                 whatever_the_disk_does.enter_context(making_safe())
                 whatever_the_disk_does.callback(instrument.close)
                 instrument.connect()
                 instrument.stop()
-                if said:
+                if message:
                     _check_shut(instrument)
-                    self._tell(said)
+                    self._tell(message)
             self._is_safe()
         except Exception:
             log.debug("session %s: an instrument wasn't made safe", self.session_id, exc_info=True)

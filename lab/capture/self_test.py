@@ -75,7 +75,7 @@ def _entry(station: Station, name: str) -> Address:
 
 
 def _self_test(name: str, instrument: Instrument, sheet: DataSheet | None = None) -> SelfTest:
-    told: list[SelfTest] = []
+    tests: list[SelfTest] = []
 
     def test() -> None:
         who = ""
@@ -90,20 +90,20 @@ def _self_test(name: str, instrument: Instrument, sheet: DataSheet | None = None
             contract.is_safe(instrument)
             works, words = True, "works, and is in its safe state"
             if sheet is not None and isinstance(instrument, Camera):
-                said = contradiction(name.partition(" ")[2], instrument.sensor(), sheet)
-                works, words = said is None, said or words
+                difference = contradiction(name.partition(" ")[2], instrument.sensor(), sheet)
+                works, words = difference is None, difference or words
         except (InstrumentError, NotMet) as error:
             works, words = False, str(error)
         try:
             instrument.close()
         except InstrumentError as error:
             works, words = False, str(error)
-        told.append(SelfTest(name, who, works, words))
+        tests.append(SelfTest(name, who, works, words))
 
     worker = threading.Thread(target=test, daemon=True)
     worker.start()
     worker.join(TEST_S)
-    return told[0] if told else SelfTest(name, "", False, f"didn't end within {TEST_S:g} s; switch it off and on")
+    return tests[0] if tests else SelfTest(name, "", False, f"didn't end within {TEST_S:g} s; switch it off and on")
 
 
 def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
@@ -118,12 +118,12 @@ def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
     except OSError as error:
         raise cannot_write(file, error, "name another file") from error
     try:
-        said = _said(name)
+        answer = _said(name)
         try:
-            made = driver(said.partition(" ")[0], entry.driver)(entry.address, recorder=recorder, **entry.settings)
+            made = driver(answer.partition(" ")[0], entry.driver)(entry.address, recorder=recorder, **entry.settings)
         except (InstrumentError, TypeError) as error:
             raise DeviceError(f"{name}: {error}") from error
-        return _self_test(said, made)
+        return _self_test(answer, made)
     finally:
         recorder.close()
 
@@ -133,7 +133,7 @@ def check_station(station: Station) -> list[SelfTest]:
     return list(self_tests(drivers_of(station), data_sheets(station)))
 
 
-def station_text(found: Iterable[Found]) -> str:
+def station_text(instruments: Iterable[Found]) -> str:
     """Return a station file (TOML) of the instruments that are connected. Cameras are asked for their pixels, colour
     filters and bit depth; what they don't tell becomes a comment. Raises DeviceError where there is no camera or one
     doesn't answer."""
@@ -147,8 +147,8 @@ def station_text(found: Iterable[Found]) -> str:
     cameras = 0
     exposures: list[tuple[float, float]] = []
     taken: set[str] = set()
-    there = list(found)
-    pair = sum(one.family == "camera" for one in there) > 1
+    there = list(instruments)
+    pair = sum(instrument.family == "camera" for instrument in there) > 1
     for one in there:
         if one.family == "camera" and (side := next(sides, None)) is not None:
             sensor = _sensor(side, one)
@@ -176,8 +176,8 @@ def station_text(found: Iterable[Found]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _sensor(side: str, one: Found) -> SensorInfo:
-    camera: Any = driver(one.family, one.name)(one.address)
+def _sensor(side: str, listed: Found) -> SensorInfo:
+    camera: Any = driver(listed.family, listed.name)(listed.address)
     assert isinstance(camera, Camera)
     try:
         with camera:
@@ -186,8 +186,8 @@ def _sensor(side: str, one: Found) -> SensorInfo:
         raise DeviceError(f"camera {side}: {error}") from error
 
 
-def _camera_table(side: str, one: Found, sensor: SensorInfo, pair: bool) -> list[str]:
-    lines = [f"# {one.what}", f"[cameras.{side}]", f'driver = "{one.name}"', f'address = "{one.address}"']
+def _camera_table(side: str, camera: Found, sensor: SensorInfo, pair: bool) -> list[str]:
+    lines = [f"# {camera.what}", f"[cameras.{side}]", f'driver = "{camera.name}"', f'address = "{camera.address}"']
     if pair and side == "left":
         lines += ['# output_line = "Line1"  # it leads: the line on which it gives the pulse that triggers the other']
     elif pair:

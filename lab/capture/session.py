@@ -324,13 +324,13 @@ class CaptureSession:
                         return
                     self._wait_until_resumed()
         except BaseException as error:
-            said = str(error) or type(error).__name__
-            self._record_end("failed", said + self._left_by_hand())
+            reason = str(error) or type(error).__name__
+            self._record_end("failed", reason + self._left_by_hand())
             self._tell("failed", str(error), quietly=True)
             raise
-        said = (self._ended_by or "") + self._left_by_hand()
-        self._record_end("interrupted", said)
-        self._tell("interrupted", said)
+        reason = (self._ended_by or "") + self._left_by_hand()
+        self._record_end("interrupted", reason)
+        self._tell("interrupted", reason)
 
     def _record_end(self, state: Literal["failed", "interrupted"], error: str) -> None:
         """Record how the run ended. On a full disk the reserve makes way for it."""
@@ -452,12 +452,12 @@ class CaptureSession:
                 return
             self._instruments = instruments
         try:
-            found = instruments.connect(self._check_goes_on)
-            self._check_identities(found)
+            snapshots = instruments.connect(self._check_goes_on)
+            self._check_identities(snapshots)
             if self.store.session(self.id).demands_certified:
-                self._check_certified(self.store, found, self.station)
+                self._check_certified(self.store, snapshots, self.station)
             instruments.check([entry.step for entry in self._entries if entry.finished is None])
-            self.store.set_state(self.id, "running", run=self._provenance(found), station=self.station)
+            self.store.set_state(self.id, "running", run=self._provenance(snapshots), station=self.station)
             self._drive(instruments)
         except BaseException as error:
             failure = error
@@ -477,32 +477,32 @@ class CaptureSession:
         if self.safe.complaints:
             raise DeviceError(f"{self._ended_by or 'at its end'}; {UNSAFE}: {'; '.join(self.safe.complaints)}")
 
-    def _check_identities(self, found: Snapshots) -> None:
+    def _check_identities(self, snapshots: Snapshots) -> None:
         """Check that the session's instruments are the same. Raises InputError if one was exchanged since the previous
         run."""
         for run in self.store.runs(self.id)[-1:]:
-            for name, one in found.items():
+            for name, snapshot in snapshots.items():
                 before = run.instruments[name].serial_number if name in run.instruments else ""
-                if before and one.serial_number and before != one.serial_number:
+                if before and snapshot.serial_number and before != snapshot.serial_number:
                     raise InputError(
-                        f"session {self.id}: {name} has the serial number {one.serial_number}, the session began with "
-                        f"{before}; connect that one again or start a new session"
+                        f"session {self.id}: {name} has the serial number {snapshot.serial_number}, the session began "
+                        f"with {before}; connect that one again or start a new session"
                     )
 
-    def _provenance(self, found: Snapshots) -> RunRecord:
+    def _provenance(self, snapshots: Snapshots) -> RunRecord:
         """Return the record of this run; what differs of the instruments from the run before is told now."""
         versions = {"python": platform.python_version()}
         for package in PACKAGES:
             with contextlib.suppress(PackageNotFoundError):
                 versions[package] = version(package)
         session, before = self.store.run_before(self.id) or ("", None)
-        changes = () if before is None else differences(before.instruments, found)
+        changes = () if before is None else differences(before.instruments, snapshots)
         for line in changes:
             self._tell("connecting", "looking at the instruments", remark=f"{line} (in session {session})")
         return RunRecord(
             started=now(),
             steps_done=self._done,
-            instruments=dict(found),
+            instruments=dict(snapshots),
             versions=versions,
             compared_with=session,
             changes=changes,

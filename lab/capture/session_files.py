@@ -85,9 +85,9 @@ class SessionFiles:
 
 
 def _intact(content: bytes, place: StoredPlace) -> bytes:
-    found = hashlib.sha256(content).hexdigest()
-    if found != place.sha256:
+    actual = hashlib.sha256(content).hexdigest()
+    if actual != place.sha256:
         raise InputError(
-            f"damaged: its SHA-256 is {found[:12]}, the registry has {place.sha256[:12]}; restore it from a backup"
+            f"damaged: its SHA-256 is {actual[:12]}, the registry has {place.sha256[:12]}; restore it from a backup"
         )
     return content

@@ -170,9 +170,9 @@ class Station(Frozen):
     @property
     def devices(self) -> dict[str, Address]:
         """Its instruments by the name of their table: `monochromator`, `cameras.left`."""
-        found: dict[str, Address | None] = {family: getattr(self, family) for family in _FAMILIES}
-        found |= {f"cameras.{side}": self.cameras[side] for side in self.sides}
-        return {name: entry for name, entry in found.items() if entry is not None}
+        addresses: dict[str, Address | None] = {family: getattr(self, family) for family in _FAMILIES}
+        addresses |= {f"cameras.{side}": self.cameras[side] for side in self.sides}
+        return {name: entry for name, entry in addresses.items() if entry is not None}
 
     def list_targets(self, kind: type[TargetT]) -> dict[str, TargetT]:
         """Targets of one kind by name, in the station file's order."""
@@ -214,8 +214,8 @@ def _with_curves(tables: Any, folder: Path) -> Any:
 def _complaints(error: ValidationError) -> Iterator[str]:
     for item in error.errors():
         key = ".".join(str(part) for part in item["loc"])
-        said = item["msg"].removeprefix("Value error, ")
-        yield f"{key}: {said}" if key else said
+        problem = item["msg"].removeprefix("Value error, ")
+        yield f"{key}: {problem}" if key else problem
 
 
 def read_station(path: str | Path) -> Station:
@@ -252,7 +252,7 @@ class Drivers:
             "light_source": self.light_source,
         }
         named |= {f"camera {side}": camera for side, camera in self.cameras.items()}
-        return {name: found for name, found in named.items() if found is not None}
+        return {name: address for name, address in named.items() if address is not None}
 
 
 def _make(family: str, where: str, name: str, address: str, settings: dict[str, Any]) -> Any:

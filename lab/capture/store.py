@@ -278,8 +278,8 @@ class Store:
     def session(self, session_id: str) -> SessionInfo:
         """One session."""
         with self.reading() as db:
-            found = self._info(db, self._row(db, session_id))
-        return self._now(found)
+            info = self._info(db, self._row(db, session_id))
+        return self._now(info)
 
     def sessions(
         self,
@@ -306,8 +306,8 @@ class Store:
                 last = self._row(db, after)
                 asked = asked.where(sa.tuple_(SessionRow.created, SessionRow.id) < sa.tuple_(last.created, last.id))
             asked = asked.order_by(SessionRow.created.desc(), SessionRow.id.desc()).limit(limit)
-            found = self._infos(db, db.scalars(asked).all())
-        return [self._now(one) for one in found]
+            infos = self._infos(db, db.scalars(asked).all())
+        return [self._now(info) for info in infos]
 
     def count_sessions(self, *, search: str = "", only: Sequence[str] | None = None) -> int:
         """Return how many sessions there are, of those that `sessions` answers."""
@@ -349,8 +349,8 @@ class Store:
         with self.reading() as db:
             row = self._row(db, session_id)
             runs = tuple(RunRecord.model_validate(run) for run in row.runs)
-            found = SessionDetails(self._info(db, row), str(row.station.get("name", "")), runs)
-        return replace(found, info=self._now(found.info))
+            details = SessionDetails(self._info(db, row), str(row.station.get("name", "")), runs)
+        return replace(details, info=self._now(details.info))
 
     def runs(self, session_id: str) -> list[RunRecord]:
         """Provenance: every run of a session, in order."""
@@ -572,16 +572,18 @@ class Store:
         with self.reading() as db:
             row = self._row(db, session_id)
             runs = [RunRecord.model_validate(run) for run in row.runs]
-            told: dict[str, Any] = {"instruments": runs[-1].instruments} if runs else {}
+            statements: dict[str, Any] = {"instruments": runs[-1].instruments} if runs else {}
             if changes := tuple(line for run in runs for line in run.changes):
-                told["changes"] = changes
+                statements["changes"] = changes
             cameras: Any = {side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()}
             manifest = Manifest(
                 name=escaped(row.name) or session_id,  # of before control characters were refused
                 notes=escaped(row.notes, several_lines=True),
-                **told,
+                **statements,
                 cameras=cameras,
-                captures=tuple(_capture(session_id, one) for one in db.scalars(asked.order_by(CaptureRow.id))),
+                captures=tuple(
+                    _capture(session_id, row_of_capture) for row_of_capture in db.scalars(asked.order_by(CaptureRow.id))
+                ),
             )
             where = {path: StoredPlace(sha256, side, index) for path, sha256, side, index in db.execute(files)}
         return RecordingSet(manifest, source=session_id, files=SessionFiles(self.folder(session_id), where))
@@ -684,12 +686,12 @@ class Store:
             try:
                 with self.reading() as db:
                     rows = db.scalars(sa.select(KeyRow).order_by(KeyRow.name))
-                    found = [(row.name, row.scope, row.sha256) for row in rows]
+                    keys = [(row.name, row.scope, row.sha256) for row in rows]
             except (CannotWrite, sa.exc.SQLAlchemyError):  # a registry that can't be read doesn't stop a halt
                 if not self._keys[1]:
                     raise
-                found = self._keys[1]
-            self._keys = (time.monotonic() + KEYS_S, found)
+                keys = self._keys[1]
+            self._keys = (time.monotonic() + KEYS_S, keys)
         return self._keys[1]
 
     def knows_keys(self) -> bool:

@@ -214,9 +214,6 @@ def use_alone(registry: Path) -> None:
     _alone.add(registry.resolve())
 
 
-# --- the database -----------------------------------------------------------------------------------------------------
-
-
 def open_engine(url: str) -> sa.Engine:
     """Return the database at a URL, PostgreSQL through psycopg. Raises InputError where it can't be opened."""
     try:
@@ -255,7 +252,9 @@ def open_engine(url: str) -> sa.Engine:
     def _explain(context: sa.ExceptionContext) -> None:
         # Of a full disk, a read-only one and another user's folder, SQLite says no more than these.
         words = str(context.original_exception)
-        if not any(one in words for one in ("disk is full", "disk I/O error", "unable to open", "readonly database")):
+        if not any(
+            phrase in words for phrase in ("disk is full", "disk I/O error", "unable to open", "readonly database")
+        ):
             return
         why = why_registry_unwritable(registry)
         if "full" in words or "I/O" in words:

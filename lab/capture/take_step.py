@@ -158,12 +158,12 @@ def _stuck(
 
 def repeats_ahead(steps: Sequence[Step | None]) -> list[int]:
     """Return how many of the steps that follow each at once only repeat its exposure; None: a step that isn't taken."""
-    found = [0] * len(steps)
+    counts = [0] * len(steps)
     for at in range(len(steps) - 2, -1, -1):
         step, other = steps[at], steps[at + 1]
         if step is not None and other is not None and _repeats(step, other):
-            found[at] = found[at + 1] + 1
-    return found
+            counts[at] = counts[at + 1] + 1
+    return counts
 
 
 def _repeats(step: Step, other: Step) -> bool:
@@ -268,8 +268,8 @@ def _dark_current(instruments: Instruments) -> Plan[None]:
 
 def _start(instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> dict[Side, float]:
     """Initial exposures (s) of a search: the result of the latest search, else 10 ms."""
-    found = [result["exposure_s"] for result in results.values() if "exposure_s" in result]
-    return {side: float(found[-1][side]) if found else 0.01 for side in instruments.cameras.cameras}
+    exposures_s = [result["exposure_s"] for result in results.values() if "exposure_s" in result]
+    return {side: float(exposures_s[-1][side]) if exposures_s else 0.01 for side in instruments.cameras.cameras}
 
 
 def _exposures(step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> dict[Side, float]:
@@ -297,7 +297,7 @@ def _completed(step: Step, instruments: Instruments, dummies: int) -> tuple[Capt
     completed = []
     for capture in step.captures:
         frame = instruments.cameras.frames[capture.side]
-        told: dict[str, Any] = {
+        statements: dict[str, Any] = {
             "exposure_s": frame.exposure_s,
             "gain_db": frame.gain_db,
             "temperature_c": frame.temperature_c,
@@ -308,6 +308,8 @@ def _completed(step: Step, instruments: Instruments, dummies: int) -> tuple[Capt
         for key, field in type(capture).model_fields.items():
             for mark in field.metadata:
                 if isinstance(mark, Reading):
-                    told[key] = readings.get(mark.key)
-        completed.append(capture.model_copy(update={key: value for key, value in told.items() if value is not None}))
+                    statements[key] = readings.get(mark.key)
+        completed.append(
+            capture.model_copy(update={key: value for key, value in statements.items() if value is not None})
+        )
     return tuple(completed)

@@ -104,16 +104,16 @@ def read_session(client: Any, key: str) -> RecordingSet:
         raise InputError(f"{key}: the catalogue has no such session; it has {', '.join(list(client)[:5]) or 'none'}")
     session = client[key]
     try:
-        nodes = {one.metadata["frame"]: one for one in session["captures"].values()}
-        captures = [dict(one.metadata) for one in session["captures"].values()]
-        spectra = {one.metadata["path"]: Spectrum.of(*one.read()) for one in session["spectra"].values()}
-        targets = {one.metadata["path"]: one.read() for one in session["targets"].values()}
+        nodes = {node.metadata["frame"]: node for node in session["captures"].values()}
+        captures = [dict(node.metadata) for node in session["captures"].values()]
+        spectra = {node.metadata["path"]: Spectrum.of(*node.read()) for node in session["spectra"].values()}
+        targets = {node.metadata["path"]: node.read() for node in session["targets"].values()}
         about = json.loads(json.dumps(dict(session.metadata)))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{key}: isn't a session that calibench wrote ({one_line(error)}); name another") from error
     about.pop("session", None)
     about["cameras"] = {
-        side: {k: v for k, v in one.items() if k != "lens_file"} for side, one in about["cameras"].items()
+        side: {k: v for k, v in camera.items() if k != "lens_file"} for side, camera in about["cameras"].items()
     }
     manifest, warnings = parse_manifest(json.dumps(about | {"captures": captures}), key)
     return RecordingSet(manifest, _Fetched(nodes), spectra, targets, source=key, warnings=tuple(warnings))

@@ -32,7 +32,6 @@ from sim.parameters import Frozen, Quantity
 from sim.scene.scenes import Scene
 from sim.spectrum import Spectrum
 
-# --- registry --------------------------------------------------------------------------------------------------------
 # Models of one family that a document's `kind` tells apart, as a type for a field of a pydantic model.
 
 
@@ -94,14 +93,9 @@ class ByKind(Generic[M]):
         return {"oneOf": [handler(model.__pydantic_core_schema__) for model in self.models.values()]}
 
 
-# --- base ------------------------------------------------------------
-
-
 Cells = NDArray[np.uint8]
 #: Longest exposure of a plan, and of a capture that was exposed in seconds.
 LONGEST_EXPOSURE_S = 3600.0
-
-# --- the manifest's entry ---------------------------------------------------------------------------------------------
 
 
 class Open(BaseModel):
@@ -205,7 +199,9 @@ def names_in(item: Open) -> Iterator[tuple[str, Names, str]]:
         if isinstance(value, Open):
             yield from ((f"{key}.{inner}", mark, name) for inner, mark, name in names_in(value))
         elif isinstance(value, str):
-            mark = next((one for one in field.metadata if isinstance(one, Names)), None) or _mark(field.annotation)
+            mark = next(
+                (item_of_metadata for item_of_metadata in field.metadata if isinstance(item_of_metadata, Names)), None
+            ) or _mark(field.annotation)
             if mark is not None:
                 yield key, mark, value
 
@@ -215,15 +211,13 @@ O = TypeVar("O", bound=Open)  # noqa: E741
 
 def in_folder(item: O, folder: str) -> O:
     """Return the same object, each name and path in it prefixed by `folder/`."""
-    own = {key: f"{folder}/{name}" for key, _, name in names_in(item) if "." not in key}
+    paths = {key: f"{folder}/{name}" for key, _, name in names_in(item) if "." not in key}
     nested = {key: in_folder(value, folder) for key, value in item if isinstance(value, Open)}
-    return item.model_copy(update=own | nested)
+    return item.model_copy(update=paths | nested)
 
 
 CAPTURES: ByKind[Capture] = ByKind("capture")
 AnyCapture = Annotated[Capture, CAPTURES]
-
-# --- the station's targets --------------------------------------------------------------------------------------------
 
 
 class Target(Frozen):
@@ -257,8 +251,6 @@ class Adjustment(Target):
 TargetT = TypeVar("TargetT", bound=Target)
 TARGETS: ByKind[Target] = ByKind("target")
 AnyTarget = Annotated[Target, TARGETS]
-
-# --- the sequence of steps --------------------------------------------------------------------------------------------
 
 
 class CaptureLimits(Frozen):
@@ -323,7 +315,7 @@ class Setting(Frozen):
         """Journals that were written before there were other adjustments have the lenses' stop as `aperture`."""
         if not isinstance(value, dict) or "aperture" not in value:
             return value
-        kept = {key: one for key, one in value.items() if key != "aperture"}
+        kept = {key: part for key, part in value.items() if key != "aperture"}
         return kept if value["aperture"] is None else kept | {"by_hand": (value["aperture"],)}
 
 
@@ -468,8 +460,8 @@ def planned_keys(step_id: str, side: Side) -> dict[str, Any]:
 def usual_of(kind: type[Adjustment], station: Equipment) -> str:
     """Return the name of an adjustment's usual state. Raises InputError where the station has none, as nothing could
     be put back then."""
-    for name, one in station.list_targets(kind).items():
-        if one.is_usual(station):
+    for name, target in station.list_targets(kind).items():
+        if target.is_usual(station):
             return name
     wanted = get_args(kind.model_fields["kind"].annotation)[0]
     raise InputError(
@@ -497,9 +489,6 @@ def exposure_step(stem: str, what: str, setting: Setting, level: float, *, measu
         radiance=spectrum_path(id) if measures_light else None,
         exposure=FindExposure(level=level),
     )
-
-
-# --- the registry -----------------------------------------------------------------------------------------------------
 
 
 def register(kind: type[Capture]) -> None:

@@ -125,10 +125,10 @@ class DarkSequence(Sequence):
 def _temperature_of(station: Equipment, sensor_c: float) -> str:
     """Return the name of the target that is the temperature. Raises InputError where the station has none."""
     there = station.list_targets(TemperatureTarget).items()
-    known = {one.sensor_c: name for name, one in there if one.sensor_c is not None}
+    known = {target.sensor_c: name for name, target in there if target.sensor_c is not None}
     if sensor_c in known:
         return known[sensor_c]
-    have = ", ".join(f"{one:g} C" for one in sorted(known)) or "none"
+    have = ", ".join(f"{temperature_c:g} C" for temperature_c in sorted(known)) or "none"
     raise InputError(
         f"station: no target of kind 'sensor_temperature' with sensor_c = {sensor_c:g}; it has {have}; add "
         f'[targets."{sensor_c:g} C"] to the station file if the sensors can be brought there'

@@ -67,8 +67,8 @@ class FlareSequence(Sequence):
                 "visible rectangle"
             )
         grid = self.grid(station)
-        seen = min((at.visible[2] - at.visible[0]) * (at.visible[3] - at.visible[1]) for at in layouts)
-        half = max(1, round(0.5 * math.sqrt(BLACK_SHARE * seen) / grid.cell_px))
+        visible_px2 = min((at.visible[2] - at.visible[0]) * (at.visible[3] - at.visible[1]) for at in layouts)
+        half = max(1, round(0.5 * math.sqrt(BLACK_SHARE * visible_px2) / grid.cell_px))
         cells = np.ones((grid.rows, grid.cols), np.uint8)
         row, col = grid.rows // 2, grid.cols // 2
         cells[row - half : row + half, col - half : col + half] = 0

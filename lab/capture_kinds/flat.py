@@ -108,9 +108,9 @@ class FlatSequence(Sequence):
         """Return the steps of the dark frames after bright flats, whose light and exposure are those of a series."""
         if not self.darks_after:
             return []
-        found = next(step for step in series if isinstance(step.exposure, FindExposure))
+        searched = next(step for step in series if isinstance(step.exposure, FindExposure))
         light = next(step for step in series[::-1] if step.radiance is not None)
-        stem = found.id.removesuffix("/exposure")
+        stem = searched.id.removesuffix("/exposure")
         made = []
         for frame in range(1, BRIGHT_FRAMES + 1):
             id = f"{stem}/before-dark/{frame}"
@@ -119,10 +119,10 @@ class FlatSequence(Sequence):
                             colour_temperature_k=self.colour_temperature_k, **planned_keys(id, side))
                 for side in station.sides
             )  # fmt: skip
-            exposure = RelativeExposure(of=found.id, factor=BRIGHT / self.level_found)
+            exposure = RelativeExposure(of=searched.id, factor=BRIGHT / self.level_found)
             what = f"bright flat {frame} of {BRIGHT_FRAMES}, before dark frames"
-            made.append(Step(id=id, what=what, setting=found.setting, exposure=exposure, captures=captures))
-        closed = found.setting.model_copy(update={"wavelength_nm": None, "slit_um": None, "lamp": {}})
+            made.append(Step(id=id, what=what, setting=searched.setting, exposure=exposure, captures=captures))
+        closed = searched.setting.model_copy(update={"wavelength_nm": None, "slit_um": None, "lamp": {}})
         for frame in range(1, self.darks_after + 1):
             id = f"{stem}/dark-after/{frame}"
             darks = tuple(DarkCapture(kind="dark", **planned_keys(id, side)) for side in station.sides)
@@ -144,8 +144,8 @@ class FlatSequence(Sequence):
             lit = Setting(target=sphere, wavelength_nm=self.wavelength_nm, slit_um=slit_um, gain_db=gain_db)
         if gain_db is not None:
             stem, what = f"{stem}/{gain_db:g}dB", f"{what} at {gain_db:g} dB"
-        found = exposure_step(stem, what, lit, self.level_found, measures_light=False)
-        made = [found]
+        search = exposure_step(stem, what, lit, self.level_found, measures_light=False)
+        made = [search]
         for frame in range(1, self.frames + 1):
             light = f"{stem}/light/{frame}"
             made.append(Step(id=light, what=f"{what}: measuring the light", setting=lit, radiance=spectrum_path(light)))
@@ -157,7 +157,7 @@ class FlatSequence(Sequence):
                         id=id,
                         what=f"{what}, level {number} of {len(self.levels)}, frame {frame} of {self.frames}",
                         setting=lit,
-                        exposure=RelativeExposure(of=found.id, factor=level / self.level_found),
+                        exposure=RelativeExposure(of=search.id, factor=level / self.level_found),
                         captures=tuple(
                             FlatCapture(
                                 kind="flat",

@@ -51,7 +51,7 @@ class IrradianceCapture(Capture):
 def irradiance_nm(step: Step) -> float | None:
     """Wavelength (nm) at which a photodiode measures the irradiance beside a step's captures; None: it has one
     responsivity, and measures in light of one wavelength alone."""
-    captures = [one for one in step.captures if isinstance(one, IrradianceCapture)]
+    captures = [capture for capture in step.captures if isinstance(capture, IrradianceCapture)]
     if not captures:
         return None
     lit = (captures[0].wavelength_nm if step.setting.lamp else step.setting.wavelength_nm) or 0.0

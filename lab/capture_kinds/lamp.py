@@ -65,13 +65,15 @@ def lamp_channels(
     the station file. Raises InputError where there is none.
     """
     if colour_temperature_k is not None:
-        fit = [one for one in lights.values() if one.colour_temperature_k == colour_temperature_k]
+        fit = [light for light in lights.values() if light.colour_temperature_k == colour_temperature_k]
         wanted = f"colour_temperature_k = {colour_temperature_k:g}"
-        have = [f"{one.colour_temperature_k:g} K" for one in lights.values() if one.colour_temperature_k is not None]
+        have = [
+            f"{light.colour_temperature_k:g} K" for light in lights.values() if light.colour_temperature_k is not None
+        ]
     elif wavelength_nm:
-        fit = [one for one in lights.values() if one.wavelength_nm == wavelength_nm]
+        fit = [light for light in lights.values() if light.wavelength_nm == wavelength_nm]
         wanted = f"wavelength_nm = {wavelength_nm:g}"
-        have = [f"{one.wavelength_nm:g} nm" for one in lights.values() if one.wavelength_nm is not None]
+        have = [f"{light.wavelength_nm:g} nm" for light in lights.values() if light.wavelength_nm is not None]
     else:
         fit, wanted, have = list(lights.values()), "any colour", []
     if not fit:

@@ -174,9 +174,9 @@ def edge_steps(
     for name in sequence.edges or there:
         edge = there[name]
         lit = usual.model_copy(update={"target": name})
-        found = exposure_step(f"{stem}/{name}", f"slanted edge {name}", lit, sequence.level)
-        light = spectrum_path(found.id)
-        made.append(found)
+        exposed = exposure_step(f"{stem}/{name}", f"slanted edge {name}", lit, sequence.level)
+        light = spectrum_path(exposed.id)
+        made.append(exposed)
         for frame in range(1, sequence.frames + 1):
             id = f"{stem}/{name}/{frame}"
             captures = []
@@ -198,7 +198,7 @@ def edge_steps(
                     id=id,
                     what=f"slanted edge {name} at {edge.angle_deg:g} deg, frame {frame} of {sequence.frames}",
                     setting=lit,
-                    exposure=RelativeExposure(of=found.id),
+                    exposure=RelativeExposure(of=exposed.id),
                     captures=tuple(captures),
                 )
             )
@@ -225,7 +225,7 @@ def _turn_of(station: Equipment, turn_deg: float) -> str:
     turns = {turn.angle_deg: name for name, turn in station.list_targets(TurnTarget).items()}
     if turn_deg in turns:
         return turns[turn_deg]
-    have = ", ".join(f"{one:g}" for one in sorted(turns)) or "none"
+    have = ", ".join(f"{angle_deg:g}" for angle_deg in sorted(turns)) or "none"
     raise InputError(
         f"station: no target of kind 'turn' with angle_deg = {turn_deg:g}; it has {have}; add "
         f'[targets."turn {turn_deg:g}"] to the station file if the knife edges can be turned so'

@@ -63,7 +63,7 @@ def _stop_of(stops: Mapping[float, str], f_number: float) -> str:
     """Return the name of the target that is the stop. Raises InputError where the station has none."""
     if f_number in stops:
         return stops[f_number]
-    have = ", ".join(f"f/{one:g}" for one in sorted(stops)) or "none"
+    have = ", ".join(f"f/{f_number:g}" for f_number in sorted(stops)) or "none"
     raise InputError(
         f"station: no target of kind 'aperture' with f_number = {f_number:g}; it has {have}; add "
         f'[targets."f/{f_number:g}"] to the station file if the lens has that stop'

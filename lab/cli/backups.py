@@ -87,11 +87,11 @@ def restore(
 
     if show:
         table = Table("generation", "sessions", "files", "MiB", "calibench", box=None, pad_edge=False)
-        for one in restoring.list_generations(backup):
-            record = one.record
+        for stored in restoring.list_generations(backup):
+            record = stored.record
             mib = sum(file.bytes for file in record.files.values()) / _MIB
             version = record.calibench or "unknown"
-            table.add_row(one.name, str(record.sessions), str(len(record.files)), f"{mib:.1f}", version)
+            table.add_row(stored.name, str(record.sessions), str(len(record.files)), f"{mib:.1f}", version)
         out.print(table)
         return
     if repair and (replace or generation):

@@ -58,11 +58,17 @@ def list_calibrations(data: StoreFolder = None) -> None:
     from lab.calibration.life import calibrations as known
 
     table = _table("id", "of", "begun (UTC)", "state", "by", "until", "cameras")
-    for one in known(store_to_read(data)):
-        until = f"{one.expires:%Y-%m-%d}" if one.expires else ""
-        begun, cameras = f"{one.created:%Y-%m-%d %H:%M}", ", ".join(one.cameras.values())
+    for record in known(store_to_read(data)):
+        until = f"{record.expires:%Y-%m-%d}" if record.expires else ""
+        begun, cameras = f"{record.created:%Y-%m-%d %H:%M}", ", ".join(record.cameras.values())
         table.add_row(
-            one.id, escape(one.name), begun, one.state, escape(one.certified_by or ""), until, escape(cameras)
+            record.id,
+            escape(record.name),
+            begun,
+            record.state,
+            escape(record.certified_by or ""),
+            until,
+            escape(cameras),
         )
     out.print(table)
 
@@ -79,24 +85,30 @@ def show(id: Id, limits: LimitsFile = None, json: Json = None, data: StoreFolder
 
     check_writable(json)
     store = store_to_read(data)
-    found = calibration(store, id)
-    chosen = found.limits if limits is None and found.limits is not None else _standing(store, limits)
-    by_limit = judged(figures(store, found.id), chosen) if chosen is not None else ()
-    write_json(found.model_copy(update={"limits": chosen, "judgements": by_limit}), json)
+    record = calibration(store, id)
+    chosen = record.limits if limits is None and record.limits is not None else _standing(store, limits)
+    by_limit = judged(figures(store, record.id), chosen) if chosen is not None else ()
+    write_json(record.model_copy(update={"limits": chosen, "judgements": by_limit}), json)
     if str(json) != "-":
-        who = f" by {found.certified_by} at {found.certified:%Y-%m-%d %H:%M}" if found.certified else ""
-        out.print(escape(f"{found.id} of {found.name}: {found.state}{who}"))
+        who = f" by {record.certified_by} at {record.certified:%Y-%m-%d %H:%M}" if record.certified else ""
+        out.print(escape(f"{record.id} of {record.name}: {record.state}{who}"))
         table = _table("quantity", "side", "value", "std", "unit", "good", "mark", "figure")
-        for one in by_limit:
+        for judgement in by_limit:
             value, std = (
-                ("" if one.value is None else f"{one.value:.6g}"),
-                ("" if one.std is None else f"{one.std:.2g}"),
+                ("" if judgement.value is None else f"{judgement.value:.6g}"),
+                ("" if judgement.std is None else f"{judgement.std:.2g}"),
             )
-            numbers = (value, std, shown_unit(one.unit), one.limit.good_text)
-            table.add_row(escape(one.title or one.figure), one.side or "", *numbers, one.mark, escape(one.figure))
+            numbers = (value, std, shown_unit(judgement.unit), judgement.limit.good_text)
+            table.add_row(
+                escape(judgement.title or judgement.figure),
+                judgement.side or "",
+                *numbers,
+                judgement.mark,
+                escape(judgement.figure),
+            )
         if table.row_count:
             out.print(table)
-    if any(one.mark in ("bad", "missing") for one in by_limit):
+    if any(judgement.mark in ("bad", "missing") for judgement in by_limit):
         raise typer.Exit(EXIT_CHECK)
 
 
@@ -117,12 +129,14 @@ def certify(
     from lab.calibration import life
 
     store = store_to_read(data)
-    found = life.certify(store, id, by or _user(), _limits(store, limits), accept_warnings=accept_warnings)
-    until = f"until {found.expires:%Y-%m-%d}" if found.expires else "until it is superseded"
+    record = life.certify(store, id, by or _user(), _limits(store, limits), accept_warnings=accept_warnings)
+    until = f"until {record.expires:%Y-%m-%d}" if record.expires else "until it is superseded"
     out.print(
-        escape(f"{found.id}: certified by {found.certified_by}, {len(found.judgements)} figures within limits, {until}")
+        escape(
+            f"{record.id}: certified by {record.certified_by}, {len(record.judgements)} figures within limits, {until}"
+        )
     )
-    if found.limits is not None and (dependence := found.limits.dependence_on(found.id)) is not None:
+    if record.limits is not None and (dependence := record.limits.dependence_on(record.id)) is not None:
         warn((dependence,))
 
 
@@ -160,20 +174,20 @@ def history(
         cameras = ", ".join(dict.fromkeys(name for name, _, _ in known)) or "none"
         if camera and all(name != camera for name, _, _ in known):
             raise InputError(f"camera {camera!r} has no calibration in {store.root}; cameras that have: {cameras}")
-        for name, one, where in known:
+        for name, of, where in known:
             if camera in ("", name):
-                read_as = ", ".join(part for part in (plain_name(one, where), shown_unit(unit_of(one))) if part)
-                out.print(escape("  ".join(part for part in (name, one, where, f"({read_as})") if part)))
+                read_as = ", ".join(part for part in (plain_name(of, where), shown_unit(unit_of(of))) if part)
+                out.print(escape("  ".join(part for part in (name, of, where, f"({read_as})") if part)))
         return
-    found = looked_up(store, camera, figure, place, _standing(store, limits))
-    write_json(found, json)
+    history = looked_up(store, camera, figure, place, _standing(store, limits))
+    write_json(history, json)
     if str(json) != "-":
-        warm = any(point.temperature_c is not None for point in found.points)
-        unit = shown_unit(found.unit)
-        out.print(escape(f"{found.title or found.figure}{f', {unit}' if unit else ''}, of {found.camera}"))
+        warm = any(point.temperature_c is not None for point in history.points)
+        unit = shown_unit(history.unit)
+        out.print(escape(f"{history.title or history.figure}{f', {unit}' if unit else ''}, of {history.camera}"))
         at = ("sensor, °C",) if warm else ()
         table = _table("calibration", "begun (UTC)", "state", "value", "std", *at, "mark", "sigma", "drift")
-        for point in found.points:
+        for point in history.points:
             sigma = "" if point.significance_sigma is None else f"{point.significance_sigma:.1f}"
             values = (
                 f"{point.value:.6g}",
@@ -185,5 +199,5 @@ def history(
             )
             table.add_row(point.calibration_id, f"{point.created:%Y-%m-%d %H:%M}", point.state, *values)
         out.print(table)
-    if found.points[-1].mark == "bad" or found.points[-1].drifted:
+    if history.points[-1].mark == "bad" or history.points[-1].drifted:
         raise typer.Exit(EXIT_CHECK)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
+from lab.bench_process import mock_bench
 from lab.capture.data_folder import open_store, store_to_read
-from lab.cli.bench_process import mock_bench
 from lab.cli.console import check_writable, err, make_folder, out, write_json
 from lab.cli.sources import EngineName, Json, StoreFolder, recordings_of, run_here
 from lab.cli.tables import print_fit, print_resolving, print_sequences
@@ -92,7 +92,7 @@ def capture(
             demands_certified=certified,
         ),
     )
-    out.print(f"session: {_carried_out(request, store, station, conceal, ['capture']).session}")
+    out.print(f"session: {_carry_out(request, store, station, conceal, ['capture']).session}")
 
 
 @commands.command()
@@ -123,7 +123,7 @@ def run(
         typer.Option(
             "--recordings",
             metavar="SOURCE",
-            help="with --resolve and --station: settle what these leave in doubt, a recording set's folder or a stored "
+            help="with --resolve and --station: resolve the rivals of these, a recording set's folder or a stored "
             "session's id, by captures of the station that made them",
         ),
     ] = "",
@@ -169,7 +169,7 @@ def run(
             raise InputError(
                 "--recordings: were captured already; leave --quick, --name, --resume, --only, --set and --conceal out"
             )
-        request = _settling(recordings, station, limits, out_folder)
+        request = _request_to_resolve(recordings, station, limits, out_folder)
     else:
         session = CaptureRequest(
             session=resume,
@@ -185,20 +185,20 @@ def run(
     verb += ["--resolve"] if resolve else []
     verb += [] if resolve_minutes is None else [f"--resolve-minutes={resolve_minutes:g}"]
     verb += [] if resolve_rounds is None else [f"--resolve-rounds={resolve_rounds}"]
-    found = _carried_out(request, store, station, conceal, verb)
-    assert found.fit is not None
-    assert found.validation is not None
-    assert found.diagnosis is not None
-    print_fit(found.recordings, found.fit)
-    badge, _, headline = words.headline(found.diagnosis)
+    result = _carry_out(request, store, station, conceal, verb)
+    assert result.fit is not None
+    assert result.validation is not None
+    assert result.diagnosis is not None
+    print_fit(result.recordings, result.fit)
+    badge, _, headline = words.headline(result.diagnosis)
     out.print(f"\n[bold]{badge}[/]: {headline}")
-    for question, lines in answers(found.fit, found.validation, found.diagnosis):
+    for question, lines in answers(result.fit, result.validation, result.diagnosis):
         out.print(f"[bold]{question}[/]" if lines else "")
         for line in lines:
             out.print(escape(line))
-    print_resolving(found.diagnosis)
-    out.print("" if found.session is None else f"\nsession: {found.session}")
-    out.print(f"report: {found.report}")
+    print_resolving(result.diagnosis)
+    out.print("" if result.session is None else f"\nsession: {result.session}")
+    out.print(f"report: {result.report}")
 
 
 def _report_session(store: Store, station: Path | None, conceal: list[str] | None, request: PipelineRequest) -> None:
@@ -207,7 +207,7 @@ def _report_session(store: Store, station: Path | None, conceal: list[str] | Non
     from lab.cli.standards import report_standards
     from lab.report.standards_pdf import has_matplotlib
 
-    session = _carried_out(request, store, station, conceal, ["run", "--standards"]).session
+    session = _carry_out(request, store, station, conceal, ["run", "--standards"]).session
     assert session is not None
     recordings = session_recordings(store, session)
     fitted = run_here(PipelineRequest("fit", recordings=recordings, source=session), store).fit
@@ -223,9 +223,9 @@ def _report_session(store: Store, station: Path | None, conceal: list[str] | Non
     out.print(f"\nsession: {session}")
 
 
-def _settling(source: str, station_file: Path, limits: ResolveLimits, data: Path | None) -> PipelineRequest:
-    """Return the request that settles what recordings leave in doubt, on the station that made them. Raises InputError
-    where it is another one."""
+def _request_to_resolve(source: str, station_file: Path, limits: ResolveLimits, data: Path | None) -> PipelineRequest:
+    """Return the request that resolves the rivals of recordings on the station that made them. Raises InputError where
+    the station is another one."""
     from lab.capture.station import read_station
     from lab.resolve import station_of
 
@@ -257,16 +257,16 @@ def sequences(
     check_writable(json)
     if station is None and (quick or only or parameters):
         raise InputError("--quick, --only, --set: go with a station file; give --station")
-    found = None
+    expected = None
     if station is not None:
         there = read_station(station)
         plan = full_plan(there, quick, only, parse_parameters(parameters or ()))
-        found = estimate(plan, there, step_times(open_store(data), there))
-        write_json(found, json)
+        expected = estimate(plan, there, step_times(open_store(data), there))
+        write_json(expected, json)
     elif json is not None:
         raise InputError("--json: writes what the sequences take on a station; give --station")
     if str(json) != "-":
-        print_sequences(catalogue(), found)
+        print_sequences(catalogue(), expected)
 
 
 @commands.command("put-back")
@@ -283,7 +283,7 @@ def put_back(
     from lab.capture.by_hand import left_by_hand, note_put_back
 
     root = store_to_read(data).root
-    left = {one.session: one for one in left_by_hand(root)}
+    left = {change.session: change for change in left_by_hand(root)}
     if session and session not in left:
         known = f"; those are {', '.join(left)}" if left else "; nothing is"
         raise InputError(f"session {session}: left nothing changed by hand{known}")
@@ -291,8 +291,8 @@ def put_back(
         note_put_back(root, session)
         out.print(f"session {escape(session)}: put back")
         return
-    for one in left.values():
-        out.print(f"session {escape(one.session)}: {escape(one.words)}")
+    for change in left.values():
+        out.print(f"session {escape(change.session)}: {escape(change.words)}")
     if not left:
         out.print("nothing is left changed by hand")
 
@@ -317,15 +317,21 @@ def confirm_step(
         confirm(store, session, target, "the command line")
         out.print(f"session {escape(session)}: {escape(target)} is there")
         return
-    asked = {one: question for one in store.under_way() if (question := question_of(store, one)) is not None}
-    for one, question in asked.items():
+    asked = {
+        session_id: question
+        for session_id in store.under_way()
+        if (question := question_of(store, session_id)) is not None
+    }
+    for waiting, question in asked.items():
         since = f"{question.since:%Y-%m-%d %H:%M:%S} UTC"
-        out.print(f"session {escape(one)}: {escape(question.target)}: {escape(question.instruction)} (since {since})")
+        out.print(
+            f"session {escape(waiting)}: {escape(question.target)}: {escape(question.instruction)} (since {since})"
+        )
     if not asked:
         out.print("no session waits for an operator")
 
 
-def _carried_out(
+def _carry_out(
     request: PipelineRequest, store: Store, station_file: Path | None, conceal: list[str] | None, verb: list[str]
 ) -> PipelineResult:
     """Carry out a request in this thread, with captures on the station of a file, or on a mock bench that is started
@@ -354,7 +360,7 @@ def _carried_out(
     try:
         return run_here(request, store, captured)
     except BaseException as error:
-        for left in filter(None, (left_by_session(store.root, one) for one in captured_here)):
+        for left in filter(None, (left_by_session(store.root, session_id) for session_id in captured_here)):
             err.print(f"calibench: session {escape(left.session)}: {escape(left.words)}")
         if request.capture is None and isinstance(error, KeyboardInterrupt):
             err.print("calibench: the same command goes on where it was")

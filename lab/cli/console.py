@@ -23,14 +23,8 @@ if TYPE_CHECKING:
     from lab.pipeline import PipelineProgress
 
 
-# --- What a command's exit code says. `InputError` (2) and `DeviceError` (3) carry theirs -----------------------------
-
-
+#: Exit codes; `InputError` (2) and `DeviceError` (3) carry theirs.
 EXIT_INTERNAL, EXIT_INPUT, EXIT_CHECK, EXIT_INTERRUPTED = 1, 2, 4, 130
-
-
-class Terminated(KeyboardInterrupt):
-    """SIGTERM: ends a command as Ctrl-C does."""
 
 
 class PlainConsole(Console):
@@ -88,10 +82,10 @@ def _check_takes_files(folder: Path, wanted: Path) -> None:
     exists."""
     from lab.capture.room import why_unwritable
 
-    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
-    if not there.is_dir():
-        raise InputError(f"{wanted}: can't be written into a folder, {there} is none; name another place")
-    if (why := why_unwritable(there)) is not None:
+    existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
+    if not existing.is_dir():
+        raise InputError(f"{wanted}: can't be written into a folder, {existing} is none; name another place")
+    if (why := why_unwritable(existing)) is not None:
         raise why
 
 
@@ -113,9 +107,6 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: can't be made ({error.strerror}); name another folder") from error
-
-
-# --- The progress bar of long commands, on stderr where that is a terminal --------------------------------------------
 
 
 @contextlib.contextmanager

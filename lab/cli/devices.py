@@ -48,15 +48,15 @@ def listed(
     try:
         if probe:
             for name, answer in discovery.probe(probe):
-                said = "no"
+                reply = "no"
                 if not isinstance(answer, InstrumentError):
                     answered = True
-                    said = " ".join(filter(None, (answer.maker, answer.model, answer.serial_number)))
-                table.add_row(escape(probe), escape(said), name)
+                    reply = " ".join(filter(None, (answer.maker, answer.model, answer.serial_number)))
+                table.add_row(escape(probe), escape(reply), name)
                 count += 1
         else:
-            for found in discovery.find_all(usbip):
-                table.add_row(escape(found.address), escape(found.what), found.driver or "-")
+            for instrument in discovery.find_all(usbip):
+                table.add_row(escape(instrument.address), escape(instrument.what), instrument.driver or "-")
                 count += 1
     except InstrumentError as error:
         raise DeviceError(str(error)) from error

@@ -120,29 +120,29 @@ def diagnose(
         workers=workers,
         engine=engine,
     )
-    found = run_here(request)
-    assert found.diagnosis is not None
-    write_json(found.diagnosis, json)
+    result = run_here(request)
+    assert result.diagnosis is not None
+    write_json(result.diagnosis, json)
     if save is not None:
-        _save_models(found, save)
+        _save_models(result, save)
     if str(json) != "-":
-        print_diagnosis(found.diagnosis)
-    if found.diagnosis.verdict == "nothing_judged":
+        print_diagnosis(result.diagnosis)
+    if result.diagnosis.verdict == "nothing_judged":
         raise typer.Exit(EXIT_INPUT)
 
 
-def _save_models(found: PipelineResult, path: Path) -> None:
+def _save_models(result: PipelineResult, path: Path) -> None:
     """Write each camera with its named effects and corrections, and list these on stderr."""
     from lab.formats.camera_file import write_camera
 
-    assert found.diagnosis is not None
-    for side, content in found.improved.items():
-        file = camera_path(found.recordings, side, path)
+    assert result.diagnosis is not None
+    for side, content in result.improved.items():
+        file = camera_path(result.recordings, side, path)
         make_folder(file.parent)
         write_camera(file, content)
-        acting = ", ".join(one.name for one in content.effects) or "no effect beside the baseline"
+        acting = ", ".join(effect.name for effect in content.effects) or "no effect beside the baseline"
         err.print(escape(f"camera: {file}: {acting}"))
-    for item in found.diagnosis.unexplained:
+    for item in result.diagnosis.unexplained:
         err.print(escape(f"{item.side}: {item.correction}"))
 
 
@@ -197,14 +197,14 @@ def report(
         report_file=out_file,
         engine=engine,
     )
-    for option, one in (
+    for option, value in (
         ("--fit", request.fit),
         ("--validation", request.validation),
         ("--diagnosis", request.diagnosis),
     ):
-        if one is not None and Path(one.source).name != Path(recordings.source).name:
+        if value is not None and Path(value.source).name != Path(recordings.source).name:
             err.print(
-                escape(f"calibench: {option}: computed from {one.source}, shown on the page of {recordings.source}")
+                escape(f"calibench: {option}: computed from {value.source}, shown on the page of {recordings.source}")
             )
     kept = [kind for kind, file in given.items() if file is None and store is not None and store.results(source, kind)]
     if kept and not stored:

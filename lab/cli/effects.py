@@ -53,15 +53,15 @@ def list_effects(
     from sim.extensions import refused
 
     check_writable(json)
-    told = EffectList(effects=(effect_description(name),)) if name else effect_list()
-    write_json(told, json)
+    listed = EffectList(effects=(effect_description(name),)) if name else effect_list()
+    write_json(listed, json)
     if str(json) != "-":
         warn(refused())
-        for family in told.families:
+        for family in listed.families:
             out.print(f"[bold]{escape(family.name)}[/]: {escape(family.sentence)} {escape(', '.join(family.members))}")
-        if told.families:
+        if listed.families:
             out.print()
-        for number, effect in enumerate(told.effects):
+        for number, effect in enumerate(listed.effects):
             if number:
                 out.print()
             _print_effect(effect)
@@ -136,12 +136,12 @@ def check_effect(
     """
     from lab.effect_packages import check_package
 
-    found = check_package(package)
-    for name, lines in found.items():
+    checked = check_package(package)
+    for name, lines in checked.items():
         for line in lines:
             out.print(escape(f"{name}: {line}"))
         out.print(escape(f"{name}: {f'{len(lines)} complaints' if lines else 'keeps the contract of effects'}"))
-    if any(found.values()):
+    if any(checked.values()):
         raise typer.Exit(EXIT_CHECK)
 
 
@@ -153,11 +153,11 @@ def _print_effect(effect: EffectDescription) -> None:
         table = Table(box=None, pad_edge=False)
         for heading in ("  parameter", "unit", "from", "to", "usual", "absent", "what it is"):
             table.add_column(heading)
-        for one in effect.parameters:
-            usual = "any" if one.prior is None else "{:g} ± {:g}".format(*one.prior)
-            numbers = ("-" if value is None else f"{value:g}" for value in (one.lower, one.upper))
-            absent = "-" if one.absent is None else f"{one.absent:g}"
-            table.add_row(f"  {one.name}", one.unit, *numbers, usual, absent, escape(one.meaning))
+        for parameter in effect.parameters:
+            usual = "any" if parameter.prior is None else "{:g} ± {:g}".format(*parameter.prior)
+            numbers = ("-" if value is None else f"{value:g}" for value in (parameter.lower, parameter.upper))
+            absent = "-" if parameter.absent is None else f"{parameter.absent:g}"
+            table.add_row(f"  {parameter.name}", parameter.unit, *numbers, usual, absent, escape(parameter.meaning))
         out.print(table)
     for choice in effect.choices:
         values = f" ({', '.join(choice.values)})" if choice.values else ""

@@ -9,6 +9,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
+from functools import cache
 from importlib import metadata
 from typing import Annotated, Any
 
@@ -27,10 +28,11 @@ from lab.cli import (
     simulation,
     standards,
 )
-from lab.cli.console import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, Terminated, err, out
+from lab.cli.console import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, err, out
 from lab.cli.help import complete_help
 from lab.cli.twin import commands as twin
-from lab.errors import CannotWrite, DeviceError, InputError, failure_of_environment
+from lab.errors import CannotWrite, DeviceError, InputError, Terminated, failure_of_environment
+from sim.extensions import extensions, refuse
 
 app = typer.Typer(
     name="calibench",
@@ -70,23 +72,21 @@ def everywhere(
     """Captures with, calibrates and explains cameras."""
 
 
-def attach_service_and_mocks() -> None:
-    """Add the commands of `api` and `mocks`. Only this function imports them, and only when a command line is
-    parsed."""
-    from api.command import commands as service
-    from mocks.command import commands as mocks
-
-    names = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
-    if "bench" in names:  # `main` was called before in this process
-        return
-    for others in (service, mocks):
-        app.registered_commands += others.registered_commands
-        app.registered_groups += others.registered_groups
+@cache
+def add_commands() -> None:
+    """Add the commands of the entry points `calibench.commands`, once a process: those of `api`, `mocks` and other
+    packages."""
+    for name, commands in extensions("commands"):
+        if not isinstance(commands, typer.Typer):
+            refuse("commands", name, f"{commands!r} is no typer.Typer")
+            continue
+        app.registered_commands += commands.registered_commands
+        app.registered_groups += commands.registered_groups
 
 
 def command_tree() -> Any:
-    """Return all commands, those of `api` and `mocks` among them, with their whole help."""
-    attach_service_and_mocks()
+    """Return all commands, those of entry points among them, with their whole help."""
+    add_commands()
     return complete_help(typer.main.get_command(app))
 
 
@@ -146,8 +146,8 @@ def run_command_line(commands: Callable[[], Any], program: str, arguments: list[
             return EXIT_INPUT
         if os.environ.get("CALIBENCH_DEBUG"):
             traceback.print_exc()
-        if (told := failure_of_environment(error)) is not None:
-            err.print(f"[red]{speaker}:[/] {escape(str(told))}")
+        if (failure := failure_of_environment(error)) is not None:
+            err.print(f"[red]{speaker}:[/] {escape(str(failure))}")
             return EXIT_INPUT
         text = " ".join(str(error).split())
         err.print(

@@ -47,21 +47,21 @@ def import_spectra(path: Path, to: Path) -> None:
     from lab.formats.raw_file import replacing
     from lab.formats.spectrum_csv import format_spectrum
 
-    found = read_cgats(path)
-    warn(tuple(f"{path}: {remark}" for remark in found.remarks))
-    files = {to if to.suffix.lower() == ".csv" else to / "1.csv": one for one in found.spectra.values()}
-    if len(found.spectra) > 1:
+    read = read_cgats(path)
+    warn(tuple(f"{path}: {remark}" for remark in read.remarks))
+    files = {to if to.suffix.lower() == ".csv" else to / "1.csv": spectrum for spectrum in read.spectra.values()}
+    if len(read.spectra) > 1:
         names = {
-            name: re.sub(r"^\.+|[^\w.-]", lambda match: "_" * len(match[0]), name) for name in found.spectra
+            name: re.sub(r"^\.+|[^\w.-]", lambda match: "_" * len(match[0]), name) for name in read.spectra
         }  # no hidden file, whatever a sample's name begins with
         if len(set(names.values())) < len(names) or to.suffix.lower() == ".csv":
             raise InputError(f"{to}: {path} holds {len(names)} spectra; give a folder by --out, and other names")
-        files = {to / f"{names[name]}.csv": one for name, one in found.spectra.items()}
-    for file, one in files.items():
+        files = {to / f"{names[name]}.csv": spectrum for name, spectrum in read.spectra.items()}
+    for file, spectrum in files.items():
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as partial:
-            partial.write_text(format_spectrum(one), encoding="utf-8")
-    out.print(escape(f"{to}: {len(files)} spectra, {found.quantity or 'their quantity not stated'}"))
+            partial.write_text(format_spectrum(spectrum), encoding="utf-8")
+    out.print(escape(f"{to}: {len(files)} spectra, {read.quantity or 'their quantity not stated'}"))
 
 
 def import_lens(path: Path, options: ImportOptions, lens: str, to: Path) -> None:
@@ -74,15 +74,15 @@ def import_lens(path: Path, options: ImportOptions, lens: str, to: Path) -> None
     content = read_camera(options.camera)
     if content.camera.lens.focal_length_mm is None:
         raise InputError(f"{options.camera}: lens.focal_length_mm is not set; write the lens's, as {path} has several")
-    found = read_lensfun(path, content.camera, lens)
+    model = read_lensfun(path, content.camera, lens)
     try:
-        made, remarks = with_lens(content, found)
+        made, remarks = with_lens(content, model)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     warn(tuple(f"{path}: {remark}" for remark in remarks))
     write_camera(to, made)
-    had = [name for name in ("distortion", "vignetting", "tca") if getattr(found, name) is not None]
-    out.print(escape(f"{to}: {found.model} at {found.focal_length_mm:g} mm: {', '.join(had)}"))
+    had = [name for name in ("distortion", "vignetting", "tca") if getattr(model, name) is not None]
+    out.print(escape(f"{to}: {model.model} at {model.focal_length_mm:g} mm: {', '.join(had)}"))
 
 
 def export_spectra(source: str, to: Path, quantity: str, data: Path | None) -> None:

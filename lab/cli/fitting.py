@@ -59,9 +59,9 @@ def fit(
 
 
 def _fit(recordings: RecordingSet) -> FitResult:
-    found = run_here(PipelineRequest("fit", recordings=recordings)).fit
-    assert found is not None
-    return found
+    fit = run_here(PipelineRequest("fit", recordings=recordings)).fit
+    assert fit is not None
+    return fit
 
 
 def _write_maps(recordings: RecordingSet, folder: Path) -> None:
@@ -90,7 +90,7 @@ def _write_cameras(recordings: RecordingSet, result: FitResult, folder: Path) ->
         write_camera(folder / f"{side}.toml", content)
         stated = recordings.camera(side)
         assumed = (*assumptions(stated, fitted), *assumed_noise(stated, fitted, content.camera))
-        taken = "; ".join(f"{one.quantity} taken as {one.value}" for one in assumed)
+        taken = "; ".join(f"{assumption.quantity} taken as {assumption.value}" for assumption in assumed)
         note = f" (neither fitted nor stated: {taken})" if taken else ""
         err.print(escape(f"camera: {folder / f'{side}.toml'}{note}"))
         warn(tuple(f"{folder / f'{side}.toml'}: {line}" for line in limited_values(fitted)))

@@ -112,8 +112,8 @@ def import_(
 
     Example: calibench import --from raw-folder frames --out my-camera
     """
+    from lab.foreign_recordings import read_foreign
     from lab.formats import recording_set
-    from lab.formats.importers import read_foreign
     from lab.formats.importers.single_picture import ImportOptions, chart_corners, grid
 
     if transfer not in ("", "linear", "srgb"):
@@ -149,10 +149,10 @@ def import_(
         return
     recordings = read_foreign(kind, path, options)
     warn(recordings.warnings)
-    found: list[str] = []
+    warnings: list[str] = []
     with progress_bar("import") as advance:
-        folder = recording_set.write(recordings, out_folder, progress=advance, told=found.extend)
-    warn(tuple(found))
+        folder = recording_set.write(recordings, out_folder, progress=advance, told=warnings.extend)
+    warn(tuple(warnings))
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 
@@ -266,9 +266,6 @@ def export(
     with progress_bar("export") as advance:
         folder = recording_set.write(recordings, Path(to), progress=advance)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
-
-
-# --- `calibench kinds` ------------------------------------------------------------------------------------------------
 
 
 @commands.command()

@@ -79,12 +79,12 @@ def _print_lens(result: LensResult) -> None:
         table.add_column(heading, justify="right")
     at = result.reference_wavelength_nm
     first = result.fields[0].mtf
-    curve = next(i for i, one in enumerate(first) if one.wavelength_nm == at)
+    curve = next(i for i, psf in enumerate(first) if psf.wavelength_nm == at)
     frequencies = first[curve].frequency_lp_per_mm
     for frequency in frequencies:
         table.add_column(f"MTF S/T, {frequency:g} lp/mm", justify="right")
     for field in result.fields[::4] if len(result.fields) == 21 else result.fields:
-        nearest = min(field.psf, key=lambda one: abs(one.wavelength_nm - at))
+        nearest = min(field.psf, key=lambda psf: abs(psf.wavelength_nm - at))
         mtf = field.mtf[curve]
         table.add_row(
             f"{field.angle_deg:.2f}",

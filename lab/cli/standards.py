@@ -69,15 +69,15 @@ def report_standards(
     if report_folder is not None or pdf is not None:
         from lab.report.standards import sections, write_standards
 
-        found = sections(result, recordings, fitted)
+        read_off = sections(result, recordings, fitted)
         if report_folder is not None:
-            page = write_standards(report_folder, result, recordings, found)
+            page = write_standards(report_folder, result, recordings, read_off)
             err.print(f"report: {escape(str(page))}")
         if pdf is not None:
             from lab.report.standards_pdf import write_standards_pdf
 
             name = recordings.manifest.name or result.source
-            err.print(f"pdf: {escape(str(write_standards_pdf(pdf, result, found, name)))}")
+            err.print(f"pdf: {escape(str(write_standards_pdf(pdf, result, read_off, name)))}")
     if str(json) != "-":
         print_standards(result)
 
@@ -89,12 +89,12 @@ def print_standards(result: StandardsResult) -> None:
     for reading in result.readings:
         out.print(f"\n[bold]{escape(reading.standard)}[/], {reading.side}, {escape(reading.subject)}")
         table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
-        for one in reading.figures:
-            value = escape(one.reason)
-            if one.estimate is not None:
-                value = escape(measured(one.estimate.value, one.estimate.std, one.estimate.unit))
-                value += "" if one.by_the_standard else "  [yellow]not by the standard[/]"
-            table.add_row(escape(one.symbol), escape(one.quantity), value)
+        for figure in reading.figures:
+            value = escape(figure.reason)
+            if figure.estimate is not None:
+                value = escape(measured(figure.estimate.value, figure.estimate.std, figure.estimate.unit))
+                value += "" if figure.by_the_standard else "  [yellow]not by the standard[/]"
+            table.add_row(escape(figure.symbol), escape(figure.quantity), value)
         out.print(table)
         for deviation in reading.deviations:
             out.print(f"  [yellow]![/] {escape(deviation.line)}")

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     )
 
 
-def print_sequences(catalogue: tuple[SequenceDescription, ...], found: PlanEstimate | None) -> None:
+def print_sequences(catalogue: tuple[SequenceDescription, ...], planned_session: PlanEstimate | None) -> None:
     """The catalogue; with `found`, the sequences of a plan with their values, captures and time."""
-    planned = {one.name: one for one in found.sequences} if found is not None else {}
+    planned = {sequence.name: sequence for sequence in planned_session.sequences} if planned_session is not None else {}
     for sequence in catalogue:
-        if found is not None and sequence.name not in planned:
+        if planned_session is not None and sequence.name not in planned:
             continue
         there = planned.get(sequence.name)
         takes = ""
@@ -36,25 +36,26 @@ def print_sequences(catalogue: tuple[SequenceDescription, ...], found: PlanEstim
             takes = f": {there.captures} captures, {_duration(there.estimated_s, there.learned)}"
         out.print(f"[bold]{sequence.name}[/]{takes}: {escape(sequence.purpose)}")
         table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2), show_header=False)
-        for one in sequence.parameters:
-            value = "" if there is None else _values(there.parameters[one.name])
-            unit = "" if one.unit == "1" else one.unit
-            bounds = " .. ".join("" if bound is None else f"{bound:g}" for bound in (one.lower, one.upper))
-            table.add_row(one.name, value, unit, escape(one.meaning), f"({bounds})")
+        for parameter in sequence.parameters:
+            value = "" if there is None else _values(there.parameters[parameter.name])
+            unit = "" if parameter.unit == "1" else parameter.unit
+            bounds = " .. ".join("" if bound is None else f"{bound:g}" for bound in (parameter.lower, parameter.upper))
+            table.add_row(parameter.name, value, unit, escape(parameter.meaning), f"({bounds})")
         out.print(table)
-    if found is not None:
-        learned = all(one.learned for one in found.sequences)
-        out.print(f"{found.captures} captures in {found.steps} steps, {_duration(found.estimated_s, learned)}")
+    if planned_session is not None:
+        learned = all(sequence.learned for sequence in planned_session.sequences)
+        duration = _duration(planned_session.estimated_s, learned)
+        out.print(f"{planned_session.captures} captures in {planned_session.steps} steps, {duration}")
 
 
 def _values(value: float | tuple[float, ...] | None) -> str:
     if isinstance(value, tuple):
-        return ", ".join(f"{one:g}" for one in value)
+        return ", ".join(f"{number:g}" for number in value)
     return "all" if value is None else f"{value:g}"
 
 
 def _duration(seconds: float, learned: bool) -> str:
-    """A time in words; one that no session of the station showed is called a guess."""
+    """Return a time in words; marked as estimated where no session of the station showed it."""
     words = (
         f"{seconds:.0f} s"
         if seconds < 90
@@ -62,7 +63,7 @@ def _duration(seconds: float, learned: bool) -> str:
         if seconds < 5400
         else f"{seconds / 3600:.1f} h"
     )
-    return f"about {words}" if learned else f"perhaps {words}"
+    return f"about {words}" if learned else f"about {words} (estimated)"
 
 
 def print_skipped(skipped: tuple[Skipped, ...]) -> None:
@@ -99,7 +100,7 @@ def print_fit(recordings: RecordingSet, fit: FitResult) -> None:
 
 def _print_emva1288(fit: FitResult) -> None:
     """The standard's own figures of each camera, by plane of its mosaic, and what the standard's recordings lack."""
-    from lab.report.emva import compared_estimates, table_rows
+    from lab.report.emva import compare_estimates, table_rows
 
     for side, camera in fit.cameras.items():
         if camera.noise is None or not camera.noise.emva1288:
@@ -113,7 +114,7 @@ def _print_emva1288(fit: FitResult) -> None:
         out.print(table)
         for remark in dict.fromkeys(remark for plane in planes.values() for remark in plane.remarks):
             out.print(f"{side}: EMVA 1288: {escape(remark)}")
-        for line in compared_estimates(camera.noise):
+        for line in compare_estimates(camera.noise):
             out.print(f"{side}: {escape(line)}")
         out.print()
 
@@ -144,8 +145,10 @@ def print_diagnosis(diagnosis: DiagnosisResult) -> None:
     if diagnosis.held_out is not None:
         held = diagnosis.held_out
         captures = f"{len(held.captures)} held-out captures"
-        beside = "" if held.chi2_discovered is None else f", {held.chi2_discovered:.0f} with laws without a name"
-        out.print(f"{captures}: chi2 {held.chi2_before:.0f} before, {held.chi2_after:.0f} after{beside}, n = {held.n}")
+        with_laws = "" if held.chi2_discovered is None else f", {held.chi2_discovered:.0f} with laws without a name"
+        out.print(
+            f"{captures}: chi2 {held.chi2_before:.0f} before, {held.chi2_after:.0f} after{with_laws}, n = {held.n}"
+        )
     departing = {(m.side, m.measurement) for m in diagnosis.mismatches}
     departing |= {(u.side, u.measurement) for u in diagnosis.unexplained}
     table = Table(box=None, pad_edge=False)
@@ -153,9 +156,9 @@ def print_diagnosis(diagnosis: DiagnosisResult) -> None:
         table.add_column(heading)
     for fit in diagnosis.measurements:
         if (fit.side, fit.measurement) in departing:
-            seen = (str(fit.n), f"{fit.chi2_before:.0f}", f"{fit.chi2_after:.0f}")
+            used = (str(fit.n), f"{fit.chi2_before:.0f}", f"{fit.chi2_after:.0f}")
             held_out = (str(fit.held_out_n), f"{fit.held_out_before:.0f}", f"{fit.held_out_after:.0f}")
-            table.add_row(fit.measurement, fit.side, *seen, *(held_out if fit.held_out_n else ("-", "-", "-")))
+            table.add_row(fit.measurement, fit.side, *used, *(held_out if fit.held_out_n else ("-", "-", "-")))
     if table.row_count:
         out.print(table)
     if diagnosis.next_capture:

@@ -66,15 +66,15 @@ def predict(
     if not model.exists():
         raise InputError(f"{model}: isn't there; name a camera file, or the folder of `diagnose --save`")
     recordings = recordings_of(plan, data)
-    found = predicted(
+    prediction = predicted(
         _models(recordings, model), recordings, changes, model=str(model), light_std=light_std_percent / 100.0,
         fitted=None if fitted is None else recordings_of(fitted, data),
     )  # fmt: skip
-    hashed = seal(found, out_file)
-    for side, one in found.sides.items():
-        for skipped in one.skipped:
+    hashed = seal(prediction, out_file)
+    for side, sealed_side in prediction.sides.items():
+        for skipped in sealed_side.skipped:
             out.print(escape(f"{side}: not predicted: {skipped.reason}"))
-        out.print(escape(f"{side}: {len(one.numbers)} numbers predicted"))
+        out.print(escape(f"{side}: {len(sealed_side.numbers)} numbers predicted"))
     out.print(escape(f"sealed: {out_file}, SHA-256 {hashed}"))
 
 
@@ -100,11 +100,11 @@ def score(
     json: Json = None,
     sha256: Annotated[
         str | None,
-        typer.Option("--sha256", metavar="HASH", help="the hash as it was told, in place of the file beside"),
+        typer.Option("--sha256", metavar="HASH", help="the hash, in place of that in the file SEALED.sha256"),
     ] = None,
     data: StoreFolder = None,
 ) -> None:
-    """Open a sealed prediction against the recordings: deviations, intervals, and names that don't survive.
+    """Open a sealed prediction against the recordings: deviations, intervals, and effects that it contradicts.
 
     Example: calibench twin score f8.json session-at-f8
     """
@@ -113,30 +113,31 @@ def score(
 
     check_writable(json)
     prediction = open_seal(sealed, sha256)
-    found = scored(prediction, recordings_of(source, data))
-    write_json(found, json)
+    score = scored(prediction, recordings_of(source, data))
+    write_json(score, json)
     if str(json) != "-":
-        _print(found)
+        _print(score)
 
 
-def _print(found: TwinScore) -> None:
+def _print(score: TwinScore) -> None:
     from lab.twin.score import conclusion, title
 
     table = Table(box=None, pad_edge=False)
     for heading in ("quantity", "n", "median", "95 % of all within", "in 95 % intervals", "chi2 / n"):
         table.add_column(heading, justify="left" if heading == "quantity" else "right")
-    for one in found.quantities:
-        unit = " %" if one.unit == "%" else ""
+    for quantity in score.quantities:
+        unit = " %" if quantity.unit == "%" else ""
         table.add_row(
-            title(one.quantity), str(one.n), f"{one.median:.3g}{unit}", f"{one.largest_of_95_percent:.3g}{unit}",
-            f"{100 * one.within_95_percent_interval:.1f} %", f"{one.chi2 / one.n:.2f}",
+            title(quantity.quantity), str(quantity.n),
+            f"{quantity.median:.3g}{unit}", f"{quantity.largest_of_95_percent:.3g}{unit}",
+            f"{100 * quantity.within_95_percent_interval:.1f} %", f"{quantity.chi2 / quantity.n:.2f}",
         )  # fmt: skip
     out.print(table)
-    out.print(f"chi2 {found.chi2:.1f} of {found.n} numbers; {found.missing} predicted numbers weren't measured")
-    for effect in found.effects:
+    out.print(f"chi2 {score.chi2:.1f} of {score.n} numbers; {score.missing} predicted numbers weren't measured")
+    for effect in score.effects:
         out.print(escape(f"{effect.side}: {effect.words}"))
-    for side in dict.fromkeys(effect.side for effect in found.effects):
-        out.print(escape(f"{side}, after this session: {conclusion([e for e in found.effects if e.side == side])}"))
+    for side in dict.fromkeys(effect.side for effect in score.effects):
+        out.print(escape(f"{side}, after this session: {conclusion([e for e in score.effects if e.side == side])}"))
 
 
 @commands.command()
@@ -150,8 +151,8 @@ def budget(
     json: Json = None,
     data: StoreFolder = None,
 ) -> None:
-    """Which effects and parameters, at their present uncertainty, matter for a use, how much each adds to its variance,
-    and which sequence of a station would reduce its error most for a minute of lab time.
+    """List the contributions of effects and parameters to the variance of an application, and the sequences of a
+    station by the reduction of that variance per minute of lab time.
 
     Example: calibench twin budget camera.toml --use mtf
     """
@@ -166,24 +167,24 @@ def budget(
     there = None if station is None else read_station(station)
     store = None if there is None else existing_store(data)
     times = None if there is None or store is None else step_times(store, there)
-    found = budgeted(read_camera(model), uses, there, times)
-    write_json(found, json)
+    budgets = budgeted(read_camera(model), uses, there, times)
+    write_json(budgets, json)
     if str(json) == "-":
         return
-    for one in found.uses:
-        out.print(escape(f"{one.use}: standard deviation {one.std_percent:.3g} %"))
+    for budget in budgets.uses:
+        out.print(escape(f"{budget.use}: standard deviation {budget.std_percent:.3g} %"))
         table = Table(box=None, pad_edge=False)
         for heading in ("what", "share of the variance", "alone"):
             table.add_column(heading, justify="left" if heading == "what" else "right")
-        for part in one.contributions:
+        for part in budget.contributions:
             table.add_row(escape(part.name), f"{part.share_percent:.1f} %", f"{part.std_percent:.3g} %")
         out.print(table)
-        if not one.captures:
+        if not budget.captures:
             continue
         table = Table(box=None, pad_edge=False)
         for heading in ("sequence", "minutes", "then", "less for a minute"):
             table.add_column(heading, justify="left" if heading == "sequence" else "right")
-        for gain in one.captures:
+        for gain in budget.captures:
             about = "" if gain.is_learned else "about "
             table.add_row(
                 escape(gain.sequence), f"{about}{gain.minutes:.1f}", f"{gain.std_percent:.3g} %",

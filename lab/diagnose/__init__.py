@@ -25,7 +25,7 @@ from lab.diagnose.side import SideFindings, diagnose_side
 from lab.engine import DEFAULT_ENGINE, Engine
 from lab.errors import InputError
 from lab.formats.camera_file import CameraFile
-from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import DiagnosisResult, FitResult
 from lab.one_blas_thread import one_blas_thread
 from lab.side_processes import Task, in_processes
@@ -127,7 +127,7 @@ def examine(
         from lab.diagnose.evidence.merge import merged_evidence
         from lab.diagnose.evidence.side import diagnose_side_by_evidence
 
-        again = refit if refit is not None or fit is None else partial(_as_given, fit)
+        again = refit if refit is not None or fit is None else partial(_as_given, fit, recordings.manifest)
         by_evidence = in_order(
             {
                 side: partial(
@@ -156,9 +156,11 @@ def examine(
     return Diagnosis(result, improved, doubts)
 
 
-def _as_given(fit: FitResult, used: RecordingSet) -> FitResult:
-    """Return a fit that is given, whatever is used."""
-    return fit
+def _as_given(fit: FitResult, stated: Manifest, used: RecordingSet) -> FitResult:
+    """Return a fit that is given, whatever is used; without the cameras whose mosaic isn't the one that was stated: the
+    fit mixed their planes."""
+    kept = {s: c for s, c in fit.cameras.items() if used.camera(s).cfa == stated.cameras[s].cfa}
+    return fit.model_copy(update={"cameras": kept})
 
 
 def _check_arguments(engine: Engine, bootstrap: int, policy: DecisionPolicy | None) -> None:

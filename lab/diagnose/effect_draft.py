@@ -161,6 +161,9 @@ def draft(law: DiscoveredLaw, number: int, source: str, file: Path) -> tuple[str
         raise InputError(f"{file}: an effect is named after its file; name one like sim/effects/unequal_codes.py")
     if name in library():
         raise InputError(f"{file}: there is an effect named {name} already; take another name")
+    if law.curve_of or (law.stage, law.along, law.of) not in PLACES:
+        what = f"a curve of the measurement {law.curve_of}" if law.curve_of else f"a curve by {law.along}"
+        raise InputError(f"law {number} of {source}: is {what}, which no stage of the chain has; draft another law")
     fields = {"stage", "along", "of", "period", "columns", "first", "at", "table"}
     found = EmpiricalLaw.model_validate({**law.model_dump(include=fields), "strength": 1.0})
     return _effect(law, found, number, source, name), _test(law, found, name)

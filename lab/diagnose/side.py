@@ -21,6 +21,7 @@ from lab.diagnose.inference.side_model import dataset_of, measurement_model
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.metadata.stated_light import impossible_efficiency, misstated_light
+from lab.diagnose.outcome.corrections import with_laws
 from lab.diagnose.outcome.determined import combinations
 from lab.diagnose.outcome.goodness_of_fit import (
     detectability,
@@ -42,7 +43,6 @@ from lab.diagnose.outcome.mismatches import (
     shown_in,
     unexplained,
     vetoed_names,
-    with_laws,
 )
 from lab.diagnose.outcome.names_in_doubt import names_in_doubt
 from lab.diagnose.outcome.next_capture import Doubt

@@ -118,11 +118,11 @@ def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told
         told(name)
         return result
 
-    def fitted_geometry() -> GeometryFit | None:
+    def fit_geometry_of_side() -> GeometryFit | None:
         return step("geometry", lambda: fit_geometry(recordings, side))
 
     with ThreadPoolExecutor(1, thread_name_prefix="fit") as pool:
-        geometry = pool.submit(fitted_geometry)
+        geometry = pool.submit(fit_geometry_of_side)
         edges_left_out: list[str] = []
         exchanged = exchanged_frames(recordings, side)
         drifts = find_drifts(recordings, side, left_out=() if exchanged is None else exchanged.captures)

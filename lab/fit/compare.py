@@ -180,7 +180,6 @@ def _without_temperature(a: CameraFit, b: CameraFit, side: Side) -> Iterator[Ski
         )
 
 
-# --- significance ----------------------------------------------------------------------------------------------------
 def sigma_of_probability(p_value: float) -> float:
     """Express a probability as standard deviations of a normal distribution, two-sided."""
     return -float(special.ndtri(max(p_value, 1e-300) / 2.0))
@@ -196,7 +195,6 @@ def _sidak_whole(p_value: float, number: int) -> float:
     return float(-np.expm1(number * np.log1p(-min(p_value, 1.0 - 1e-16))))
 
 
-# --- numbers, by their names -----------------------------------------------------------------------------------------
 def numbers_of(model: Frozen, prefix: str) -> Iterator[tuple[str, Numbers]]:
     """Yield every fitted number under `model`, by name, each name once. A model in a list is named by its text fields:
     capture, channel, board; by its number, too, where others have the same.
@@ -359,7 +357,6 @@ def place_of(numbers: Numbers, at: int) -> str:
     return f"[{place}]"
 
 
-# --- geometry --------------------------------------------------------------------------------------------------------
 def _covariance(fit: GeometryFit) -> Array | None:
     """Return the covariance (12, 12) of the intrinsics, or None where the fit doesn't state it."""
     if fit.covariance is None:
@@ -479,7 +476,7 @@ class FailRule:
         """Tell whether the rule names a figure of a side."""
         return fnmatchcase(name, self.figure) and self.side in (None, side)
 
-    def _exceeded(self, row: Change) -> bool:
+    def _exceeds(self, row: Change) -> bool:
         """Tell whether a change is larger than the amount."""
         return abs(row.difference) > self.amount * (abs(row.a) if self.relative else 1.0)
 
@@ -494,7 +491,7 @@ class FailRule:
         rows = [
             " ".join(part for part in (row.side, row.name, row.where) if part)
             for row in comparison.changes
-            if row.changed and self._names(row.name, row.side) and self._exceeded(row)
+            if row.changed and self._names(row.name, row.side) and self._exceeds(row)
         ]
         projections = [
             f"{item.side} {PROJECTION}"

@@ -69,9 +69,6 @@ class CameraFile:
     remarks: tuple[str, ...] = field(default=(), compare=False)
 
 
-# --- reading ----------------------------------------------------------------------------------------------------------
-
-
 def read_camera(
     file: Path,
     cache: Path | None = None,
@@ -212,12 +209,12 @@ def traced_table(
 
     Raises InputError for a prescription that can't be read or traced, and for a folder that can't be written to.
     """
-    from sim.optics.traced_table import cached_table  # here, as compiled code takes a second to import
+    from sim.optics.traced_table import read_or_trace_table  # here, as compiled code takes a second to import
     from sim.optics.zmx import read_zmx
 
     folder = cache or lens_cache()
     try:
-        return cached_table(read_zmx(prescription), folder, progress=progress)
+        return read_or_trace_table(read_zmx(prescription), folder, progress=progress)
     except ValueError as error:
         raise InputError(_first(error)) from error
     except OSError as error:
@@ -301,9 +298,6 @@ def _first(error: Exception) -> str:
         str(error) if not isinstance(error, ValidationError) else error.errors()[0]["msg"].removeprefix("Value error, ")
     )
     return " ".join(text.split())
-
-
-# --- writing ----------------------------------------------------------------------------------------------------------
 
 
 def write_camera(file: Path, content: CameraFile) -> None:
@@ -442,9 +436,6 @@ def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> Camer
             std[key] = float(value)
     remarks = remarks_on_values(recordings.camera(side), fit, model)
     return CameraFile(f"{recordings.manifest.name} {side}", model.model_copy(update={"std": std}), remarks=remarks)
-
-
-# --- the camera without a file ----------------------------------------------------------------------------------------
 
 
 def default_camera() -> CameraFile:

@@ -27,7 +27,6 @@ from lab.formats.raw_file import replacing
 from lab.formats.recording_set.files import locate
 from sim.spectrum import Spectrum
 
-# --- Text that other programs wrote: its encoding, the separators of its tables, and the names of their columns -------
 #
 # Recording sets are UTF-8 with commas and decimal points. What a user brings may be Latin-1 or UTF-16, and a table of
 # a program that is set to another language has semicolons (or tabs) with decimal commas. It is read, and a remark says
@@ -295,9 +294,6 @@ def get_quantity(name: str) -> Quantity:
     raise InputError(f"--quantity {name}: isn't known; give one of {', '.join(_WRITTEN)}")
 
 
-# --- reading ----------------------------------------------------------------------------------------------------------
-
-
 def read_cgats(file: Path) -> CgatsSpectra:
     """Read the spectra of a CGATS file's tables.
 
@@ -528,9 +524,6 @@ def _number(text: str, what: str) -> float:
     if not math.isfinite(found):
         raise InputError(f"{what} is '{text[:40]}', not a number; correct it")
     return found
-
-
-# --- writing ----------------------------------------------------------------------------------------------------------
 
 
 def write_cgats(file: Path, content: CgatsSpectra) -> tuple[str, ...]:

@@ -76,9 +76,6 @@ def write_rawtoaces(file: Path, content: CameraFile) -> tuple[str, ...]:
     return left_out(content)
 
 
-# --- matrices ---------------------------------------------------------------------------------------------------------
-
-
 def colour_matrices(camera: CameraModel, light: str) -> tuple[FloatArray, FloatArray]:
     """(ColorMatrix, ForwardMatrix), 3 x 3 each, of a camera under an illuminant of colour-science's.
 
@@ -109,8 +106,6 @@ def _fit_keeping_white(source: FloatArray, target: FloatArray) -> FloatArray:
     right = np.concatenate([source[1:].T @ target[1:], target[:1]])
     return np.asarray(np.linalg.solve(normal, right)[:3].T)
 
-
-# --- DCP --------------------------------------------------------------------------------------------------------------
 
 _ASCII, _SHORT, _LONG, _SRATIONAL, _FLOAT = 2, 3, 4, 10, 11
 _DENOMINATOR = 1_000_000
@@ -164,9 +159,6 @@ def _tiff(entries: Sequence[tuple[int, int, int, bytes]]) -> bytes:
             directory += struct.pack("<I", data_at + len(data))
             data += value + b"\0" * (len(value) % 2)
     return head + directory + struct.pack("<I", 0) + data
-
-
-# --- ICC --------------------------------------------------------------------------------------------------------------
 
 
 def write_icc(file: Path, content: CameraFile) -> tuple[str, ...]:

@@ -93,9 +93,6 @@ def geometry_of(camera: CameraModel) -> Geometry:
     )
 
 
-# --- what a format has a place for ------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Intrinsics:
     """A projection that a format has a law for: fx, fy, cx, cy (px), and its coefficients in OpenCV's order."""
@@ -221,9 +218,6 @@ def _write(file: Path, text: str) -> None:
 
 def _yaml(document: Mapping[str, Any]) -> str:
     return yaml.safe_dump(dict(document), sort_keys=False, default_flow_style=None, width=10_000)
-
-
-# --- the formats ------------------------------------------------------------------------------------------------------
 
 
 def write_opencv(file: Path, content: CameraFile, pair: Pair | None = None) -> tuple[str, ...]:

@@ -80,9 +80,6 @@ class LensfunLens:
     remarks: tuple[str, ...] = ()
 
 
-# --- writing ----------------------------------------------------------------------------------------------------------
-
-
 def write_lensfun(file: Path, content: CameraFile) -> tuple[str, ...]:
     """Write the lens of a camera as a lensfun database of one lens. Returns what its laws don't hold. Raises InputError
     where the camera doesn't say the focal length."""
@@ -206,9 +203,6 @@ def _pa(camera: CameraModel, effects: Sequence[Effect]) -> tuple[tuple[float, fl
     left = float(np.abs(light - 1.0 - design @ k).max())
     remarks = (f"vignetting: pa leaves {100 * left:.2f} % of the light at most",) if left > TOLD_SHARE else ()
     return (float(k[0]), float(k[1]), float(k[2])), remarks
-
-
-# --- reading ----------------------------------------------------------------------------------------------------------
 
 
 def read_lensfun(file: Path, camera: CameraModel, model: str = "") -> LensfunLens:

@@ -93,9 +93,6 @@ def read_picture(file: Path, page: int | None = None) -> NDArray[Any]:
     return _by_opencv(data)
 
 
-# --- TIFF -------------------------------------------------------------------------------------------------------------
-
-
 class _Contiguous:
     """A page of an ImageJ stack whose file has one directory for all of its pages."""
 
@@ -241,9 +238,6 @@ def _packed_samples(tif: Any, page: Any, bits: int, file: Path) -> NDArray[Any]:
             each[:, :, 16 - bits :] = ones.reshape(len(part), across, bits)
             found[first + at : first + at + len(part)] = np.packbits(each, axis=2).view(">u2")[..., 0]
     return found.reshape(rows, page.imagewidth, -1) if many else found
-
-
-# --- PNG, JPEG, BMP, PGM ----------------------------------------------------------------------------------------------
 
 
 def _by_opencv(data: bytes, page: int = 0) -> NDArray[Any]:

@@ -203,9 +203,6 @@ def _tag(code: int, kind: int, value: Any) -> tuple[int, int, int, Any]:
     return code, kind, len(value), tuple(value)
 
 
-# --- colour -----------------------------------------------------------------------------------------------------------
-
-
 def colour_matrix(camera: CameraModel) -> FloatArray:
     """From CIE XYZ to this camera's R, G, B under D65 (3, 3), as DNG's ColorMatrix1 wants it: white has a greatest code
     of 1.

@@ -43,9 +43,6 @@ def read_result(model: type[Result], file: Path) -> Result:
         raise InputError(f"{file}: not what --json wrote: {at} {first['msg']}; write it again") from error
 
 
-# --- Where a report's numbers come from: instruments, versions, and digests of what was evaluated ---------------------
-
-
 #: The distributions whose version can change a number.
 DISTRIBUTIONS = ("calibench", "numpy", "scipy", "opencv-contrib-python-headless", "colour-science", "rawpy")
 

@@ -25,7 +25,6 @@ from sim.scene.catalogue import SCENES, Cube, PictureOnScreen, View, scene_by_na
 from sim.scene.light import at_luminance, illuminant
 from sim.spectrum import FloatArray, Spectrum, energy_from_photons
 
-# --- Spectral scenes in OpenEXR, with several lights: each a layer (or a part) of its own radiance, which add up ------
 #
 # A layer's channels are those of the spectral OpenEXR layout (Fichet, Pacanowski, Wilkie, JCGT 10 (3), 2021; PBRT
 # writes it): `S0.550,000000nm`, radiance in W sr^-1 m^-2 nm^-1; or ISET3d's `Radiance.C01` .. `C31`, 400 to 700 nm,

@@ -4,7 +4,7 @@ Every third capture in time within a setting is held out, by its id, before anyt
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 from lab.formats.recording_set import RecordingSet
 from lab.inference.hypotheses import coordinates_of, moved, stacked
 from lab.inference.model import scaled_columns, with_columns
-from lab.observables.gaussian import BlockCovariance
+from lab.observables.gaussian import BlockCovariance, chi2
 from sim.camera import Side
 from sim.spectrum import FloatArray
 
@@ -76,7 +76,7 @@ def check_held_out(problem: SideProblem, search: Search, table: Table) -> tuple[
     weight = np.array([r.probability for r in rows])
     weight /= weight.sum()
     names = [b.measurement.name for b in problem.held_out]
-    chi2 = np.zeros((len(rows), len(names)))
+    values = np.zeros((len(rows), len(names)))
     counts = np.array([len(b.value) for b in problem.held_out])
     for k, row in enumerate(rows):
         residual, covariance = _predict(problem, search, row, table)
@@ -84,11 +84,11 @@ def check_held_out(problem: SideProblem, search: Search, table: Table) -> tuple[
         for j, n in enumerate(counts):
             own = slice(at, at + n)
             lower = BlockCovariance(covariance[own, own]).lower
-            chi2[k, j] = float(np.sum(np.square(np.linalg.solve(lower, residual[own]))))
+            values[k, j] = float(np.sum(np.square(np.linalg.solve(lower, residual[own]))))
             at += n
-    p = weight @ chdtrc(counts, chi2)
+    p = weight @ chdtrc(counts, values)
     against = holm(p, RATE)
-    found = zip(names, counts, weight @ chi2, p, against, strict=True)
+    found = zip(names, counts, weight @ values, p, against, strict=True)
     return tuple(HeldOutCheck(name, int(n), float(c), float(q), bool(no)) for name, n, c, q, no in found)
 
 
@@ -112,22 +112,50 @@ def _likeliest(table: Table) -> list[Row]:
     return found
 
 
-def _predict(problem: SideProblem, search: Search, row: Row, table: Table) -> tuple[FloatArray, FloatArray]:
-    """Residual (n*,) and covariance (n*, n*) of the held-out numbers given those that are used, under one set, its
-    parameters, theta and delta marginalised about the mode."""
-    from lab.inference.recordings import SideModel
+@dataclass(frozen=True)
+class CurvePrediction:
+    """What delta of one group, given the used numbers, takes off chi2 of n held-out numbers: chi2 of their residuals
+    without any delta of the group, and with its mean; both by the covariance without it."""
 
+    n: int
+    chi2_before: float
+    chi2_after: float
+
+
+def predict_by_curve(
+    problem: SideProblem, search: Search, table: Table, group: int, measurements: Collection[str]
+) -> CurvePrediction | None:
+    """Return how well delta of a group predicts the held-out numbers of some measurements, under the likeliest set in
+    which it is unlisted; None where none of them is held out."""
+    row = next((r for r in table.rows if group in r.unlisted and r.refitted), None)
+    names = np.array([b.measurement.name for b in problem.held_out for _ in b.value])
+    where = np.isin(names, list(measurements))
+    if row is None or not where.any():
+        return None
+    without, covariance = _predict(problem, search, row, table, without=group)
+    beside, _ = _predict(problem, search, row, table)
+    own = covariance[np.ix_(where, where)]
+    return CurvePrediction(int(where.sum()), chi2(without[where], own), chi2(beside[where], own))
+
+
+def _predict(
+    problem: SideProblem, search: Search, row: Row, table: Table, without: int | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Residual (n*,) and covariance (n*, n*) of the held-out numbers given those that are used, under one set, its
+    parameters, theta and delta marginalised about the mode. `without`: a group of which there is none."""
     fit = table.fits[row.members]
-    model = SideModel(problem.whole, problem.groups)
+    model = problem.whole_model(problem.groups)
     used = len(problem.measured.value)
     value = problem.whole.value
     gaussian = model.gaussian(fit.state, fit.likeliest.form)
-    tau = fit.likeliest.scales.mode(row.unlisted)
+    tau = fit.likeliest.scales.mode(row.unlisted).copy()
+    if without is not None:
+        tau[without] = 0.0
     disturbances = np.vstack(
         [
             scaled_columns(problem.groups, tau, used),
             np.column_stack(
-                [t * g.held_out for g, t in zip(problem.groups, tau, strict=True) if g.held_out is not None]
+                [t * g.held_out for g, t in zip(problem.groups, tau, strict=True) if g.held_out is not None and t > 0.0]
             ),
         ]
     )

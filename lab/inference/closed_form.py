@@ -39,7 +39,8 @@ _BEYOND = 4.5
 
 @dataclass(frozen=True)
 class Signature:
-    """An alternative's changes of the prediction (n, k), given no other hypothesis."""
+    """An alternative's changes of the prediction (n, k), given no other hypothesis. `is_whole`, `log_share`: as of the
+    alternative."""
 
     owner: str
     index: int  # of the alternative
@@ -47,6 +48,8 @@ class Signature:
     coordinates: tuple[Coordinate, ...]  # of the coefficients
     columns: tuple[int, ...]  # in the stacked table
     points: tuple[tuple[int, int | None], ...]  # of each column, the alternative's points of positive and negative sign
+    is_whole: bool = False
+    log_share: float = 0.0
 
     def of_points(self, c: FloatArray, count: int) -> FloatArray:
         """Return the coefficients (>= 0) of all points of the alternative, given those of the columns."""
@@ -76,7 +79,9 @@ def signatures_of(model: Model, hypotheses: Mapping[str, Hypothesis]) -> tuple[S
                 for plus, minus in points
             )
             columns = tuple(range(at, at + raw.shape[1]))
-            found.append(Signature(name, index, raw, coords, columns, points))
+            found.append(
+                Signature(name, index, raw, coords, columns, points, alternative.is_whole, alternative.log_share)
+            )
             at += raw.shape[1]
     return tuple(found)
 
@@ -101,6 +106,8 @@ def _merge_opposite(raw: FloatArray, scales: Sequence[float]) -> tuple[tuple[int
 def project_groups(gram: FloatArray, amplitude: FloatArray) -> FloatArray:
     """Return the Gram matrix of all columns after the first R with these marginalised, whose coefficients have the
     standard deviations `amplitude` (R,)."""
+    there = np.concatenate([amplitude > 0.0, np.ones(len(gram) - len(amplitude), bool)])
+    gram, amplitude = gram[np.ix_(there, there)], amplitude[amplitude > 0.0]
     at = len(amplitude)
     inner = np.eye(at) + amplitude[:, None] * gram[:at, :at] * amplitude
     across = amplitude[:, None] * gram[:at, at:]
@@ -115,16 +122,18 @@ def integrate_set(z: FloatArray, gram: FloatArray, members: Sequence[Signature])
     a, b = gram[np.ix_(own, own)], z[own]
     low = np.array([c.lower for c in coords])
     scale = np.array([c.scale for c in coords])
-    c = np.zeros(len(own))
+    whole = np.array([s.is_whole for s in members for _ in s.columns], bool)
+    c = whole.astype(float)
+    free = np.flatnonzero(~whole)
     for _ in range(40):
         before = c.copy()
-        for k in range(len(own)):
+        for k in free:
             weight = (DEGREES + 1.0) / (DEGREES + (c[k] / scale[k]) ** 2) / scale[k] ** 2
             c[k] = max((b[k] - a[k] @ c + a[k, k] * c[k]) / (a[k, k] + weight), low[k])
         if np.all(np.abs(c - before) < 1e-4 * scale):
             break
     slope = b - a @ c
-    found = integrate(a, slope, coords, c)
+    found = integrate(a[np.ix_(free, free)], slope[free], [coords[int(k)] for k in free], c[free])
     return float(b @ c - 0.5 * c @ a @ c) + found.log_integral, c
 
 
@@ -174,6 +183,9 @@ def signature_log_odds(z: FloatArray, gram: FloatArray, signatures: Sequence[Sig
     parts: list[tuple[int, float, float, float, bool]] = []
     for i, s in enumerate(signatures):
         own = list(s.columns)
+        if s.is_whole:
+            found[i] = z[own[0]] - 0.5 * gram[own[0], own[0]]
+            continue
         if len(own) > 1 and signal[own].max() > _WEAK:
             found[i] = integrate_set(z, gram, [s])[0]
             continue
@@ -238,7 +250,7 @@ class HealthyDraws:
         tau = np.array([[g.everyday] for g in groups]) * np.abs(rng.standard_normal((len(groups), draws)))
         delta = np.repeat(tau, sizes, axis=0) * rng.standard_normal((at, draws))
         residual = rng.standard_normal((len(white), draws)) + white[:, :at] @ delta
-        priors = ScaleIntegral.log_priors(len(groups), any_unlisted)
+        priors = ScaleIntegral.log_priors(groups, any_unlisted)
         scales = ScaleIntegral(gram[:at, :at], none, sizes, none, groups, priors)
         return cls(gram, white.T @ residual, np.square(residual).sum(axis=0), scales)
 
@@ -256,13 +268,18 @@ class HealthyDraws:
         groups, draws, at = self.scales.groups, self.projected.shape[1], len(self.scales.gram)
         middle = np.array([float(g.everyday_quantile(np.array(0.5))) for g in groups])
         flips = [np.zeros(draws)]
+        more_prior = self.scales.prior_log[1] - self.scales.prior_log[0]
+        for g, values in self.scales.profiles_of_processes(middle, self.projected[:at]):
+            flips.append(logsumexp(values + np.log(groups[g].shares(True))[:, None], axis=0) + more_prior[g])
         for g, group in enumerate(groups):
+            if not group.may_be_unlisted or not group.varies(False):
+                continue
             points = [group.scales(u) for u in (False, True)]
             values = self.scales.profiles(g, middle, np.concatenate(points), self.projected[:at])
             values += np.log(np.concatenate([group.shares(u) for u in (False, True)]))[:, None]
             usual, other = np.split(values, [len(points[0])])
             more = logsumexp(other, axis=0) - logsumexp(usual, axis=0)
-            flips.append(more + self.scales.prior_log[1] - self.scales.prior_log[0])
+            flips.append(more + more_prior[g])
         gains = gains_of(self._odds(middle, signatures), hypotheses, signatures)
         return 1.0 / (np.exp(logsumexp(flips, axis=0)) + others_over_empty(gains, prior))
 
@@ -272,14 +289,20 @@ class HealthyDraws:
         both = np.concatenate([self.gram, self.projected], axis=1)
         at, draws = len(self.scales.gram), self.projected.shape[1]
         amplitude = np.repeat(tau, self.scales.group_sizes)
-        inner = np.eye(at) + amplitude[:, None] * self.gram[:at, :at] * amplitude
+        there = np.flatnonzero(amplitude)
+        amplitude = amplitude[there]
+        inner = np.eye(len(there)) + amplitude[:, None] * self.gram[np.ix_(there, there)] * amplitude
         solved = cho_solve(
-            cho_factor(inner, lower=True, check_finite=False), amplitude[:, None] * both[:at, at:], check_finite=False
+            cho_factor(inner, lower=True, check_finite=False), amplitude[:, None] * both[there, at:], check_finite=False
         )
-        left = both[at:, at:] - (amplitude[:, None] * self.gram[:at, at:]).T @ solved
+        left = both[at:, at:] - (amplitude[:, None] * self.gram[there, at:]).T @ solved
         split = left.shape[1] - draws
         found = np.empty((len(signatures), draws))
         for i, s in enumerate(signatures):
+            if s.is_whole:
+                (k,) = s.columns
+                found[i] = left[k, split:] - 0.5 * left[k, k]
+                continue
             columns = zip(s.columns, s.coordinates, strict=True)
             each = np.array([log_odds_of_draws(left[k, split:], float(left[k, k]), c) for k, c in columns])
             best = each.max(axis=0)
@@ -295,7 +318,9 @@ def gains_of(
     own: dict[str, list[int]] = {}
     for i, s in enumerate(signatures):
         own.setdefault(s.owner, []).append(i)
-    return {name: log_mean_exp(ratio[own[name]]) for name in hypotheses if name in own}
+    share = np.array([s.log_share for s in signatures])
+    weighted = ratio + share.reshape(-1, *(1,) * (ratio.ndim - 1))
+    return {name: log_mean_exp(weighted[own[name]]) for name in hypotheses if name in own}
 
 
 def others_over_empty(gains: Mapping[str, FloatArray], prior: SetPrior) -> FloatArray:

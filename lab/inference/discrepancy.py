@@ -1,27 +1,33 @@
 """Small physics that no list has: groups of disturbances, each of a state of the chain of light, with everyday scales.
 
-A group's disturbance is a Gaussian process along the coordinate of its state: linear between nodes, whose values have a
-squared-exponential kernel of unit variance and a correlation length of two nodes (of the transmittance 15 nm). Its
-columns H are the changes of the whole prediction by it, so that an unlisted blur moves edges and screens by one
-function. Where no law of `sim` has the state (noise by line, defective pixels, codes), the process acts on the
-observables of that state, along their own axis, as a share of their scale."""
+The disturbances of a state are Gaussian processes, each along one coordinate: linear between nodes, whose values have a
+squared-exponential kernel of unit variance and a correlation length of two nodes (of the transmittance 15 nm). Their
+columns H are the changes of the whole prediction, so that an unlisted blur moves edges and screens by one function.
+Where no law of `sim` has the state (noise by line, defective pixels), a process acts on an observable of that state,
+along its own axis, as a share of its scale.
+
+What is everyday acts along all coordinates of a state, with one scale. What is unlisted acts along one of them: one
+large process doesn't make the others of its state probable."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal, get_args
 
 import numpy as np
 from scipy.linalg import eigh
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.inference.model import Group
+from lab.inference.model import Group, Process
 from lab.observables.dataset import Dataset
-from lab.observables.observable import Observable
+from lab.observables.observable import Label, Measurement, Observable
 from sim.effects.base import Effect
 from sim.effects.empirical_law import PLACES, Along, EmpiricalLaw, Of, Stage
 from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.effects.screen_gamma import ScreenGamma
+from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
 #: Change of a node for the differences: small, so that they are derivatives; of factors 1 %.
@@ -33,12 +39,24 @@ _NODES_CORRELATED = 2.0
 _SPECTRAL_STEP_NM, _SPECTRAL_CORRELATED, _MOST_SPECTRAL = 10.0, 1.5, 48
 #: Nodes of the transfer function, cycles a pixel: closer towards 0, where a halo of some pixels acts.
 _TRANSFER_NODES = (0.0, 0.01, 0.03, 0.06, 0.12, 0.2, 0.32, 0.46, 0.64, 0.82, 1.0)
+#: Nodes by radius: lines between them follow a parabola to 0.4 % of its height.
+_RADII = 9
+#: Nodes about the axis: what has two lobes, as a saddle, is followed to 5 % by lines.
+_ANGLES = 16
+#: The most nodes by time, at captures; of each channel's; and the most captures between which a step is tried.
+_MOST_TIMES, _FEW_TIMES, _MOST_STEPS = 12, 7, 33
+#: The most nodes by exposure.
+_MOST_EXPOSURES = 16
+#: Codes after which a table of their widths repeats: the longest period of the combs that are counted.
+_CODES_PERIOD = 8
 #: Widths of the borders of a screen's cells at which their exponent varies, px.
 _RIMS_PX = (0.0, 0.3)
 #: Correlation between two channels, and between two conditions, of one observable.
 _BETWEEN = 0.7
 #: Columns of a group that are kept, by what they may change at its largest scale: variances, in the numbers' noise.
-MOST_COLUMNS, LEAST_VARIANCE = 24, 1e-2
+MOST_COLUMNS, MOST_ON_OBSERVABLE, LEAST_VARIANCE = 24, 12, 1e-2
+#: Largest everyday scale, in s_g, at which directions count.
+_EVERYDAY_MOST = 3.0
 
 
 @dataclass(frozen=True)
@@ -55,17 +73,22 @@ class GroupDeclaration:
     observables: tuple[str, ...] = ()
 
 
-TRANSFER, FIELD, SPECTRAL, RESPONSE, SOURCE, OFFSET, SHOT, BORDERS = (
+TRANSFER, FIELD, SPECTRAL, LINES, RESPONSE, SOURCE, OFFSET, SHOT, ROWS, BORDERS = (
     GroupDeclaration(
         "transfer", 0.002, "1, of the transfer function",
         "healthy sets of a simulator with transfer functions in closed form: 0.1 % at most; twice that for real lenses",
     ),
     GroupDeclaration(
-        "field", 0.0005, "1, of the irradiance by place", "healthy sets: 0.03 % at most beside the free tilt and bow",
+        "field", 0.0005, "1, of the irradiance by place, and of the shortest exposure",
+        "healthy sets: 0.03 % at most beside the free tilt and bow", observables=("flat_field",),
     ),
     GroupDeclaration(
         "spectral", 0.002, "1, of the transmittance by wavelength",
         "healthy sets: 0.1 % at most; coated windows ripple by twice that",
+    ),
+    GroupDeclaration(
+        "narrowband wavelength", 0.02, "nm, of the displacement of narrowband light by wavelength",
+        "repeatability of grating monochromators: 0.02 to 0.1 nm; healthy sets: none", largest=10.0,
     ),
     GroupDeclaration(
         "response", 0.0005, "1, of the signal by level and exposure", "healthy sets: 0.015 %",
@@ -75,11 +98,14 @@ TRANSFER, FIELD, SPECTRAL, RESPONSE, SOURCE, OFFSET, SHOT, BORDERS = (
     ),
     GroupDeclaration(
         "offset", 0.01, "read noise, of the offset by time, exposure and place",
-        "healthy sets: 0.007 at most", largest=10.0,
+        "healthy sets: 0.007 at most", largest=10.0, observables=("dark_field",),
     ),
     GroupDeclaration(
         "shot noise", 0.005, "1, of the temporal variance by level",
         "healthy sets: 1 % is not excluded",
+    ),
+    GroupDeclaration(
+        "rows that repeat", 0.00005, "1, of the sensitivity by row", "healthy sets of two simulators",
     ),
     GroupDeclaration(
         "borders of cells", 0.05, "1, of the exponent of a screen's light by its drive",
@@ -106,7 +132,7 @@ ON_OBSERVABLES = (
     ),
     GroupDeclaration(
         "gain by line", 0.00005, "1, of the observable's scale", "healthy sets of two simulators",
-        observables=("green_balance", "flat_lines", "row_periods", "line_gains", "flat_pattern"),
+        observables=("green_balance", "flat_lines", "line_gains", "flat_pattern"),
     ),
     GroupDeclaration(
         "screens", 0.001, "1, of the observable's scale", "screens drawn to 1/55 px; drawn to 1/25 px they leave 0.7 %",
@@ -130,175 +156,344 @@ def groups_of(model: MeasurementModel, dataset: Dataset, used: int) -> tuple[Gro
     where = np.arange(len(model.value)) < used
     gaussian = model.gaussian((), where, 0.0)
     base = model.mean()
-    declared: list[tuple[GroupDeclaration, FloatArray]] = [
-        (group, np.column_stack([*_columns(model, base, processes(dataset))] or [np.zeros((len(base), 0))]))
-        for group, processes in _ON_STATES.items()
+    declared: list[tuple[GroupDeclaration, list[_Columns]]] = [
+        (group, [*_on_state(model, base, curves(dataset)), *_on_observables(model, group.observables, used)])
+        for group, curves in _ON_STATES.items()
     ]
     taken = {name for group in ON_OBSERVABLES for name in group.observables}
     read = {b.measurement.name for b in model.blocks if b.reads and b.measurement.name not in taken}
     on_boards = tuple(sorted(n for n in read if _is_of_boards(model, n)))
     for group in (*ON_OBSERVABLES, GEOMETRY):
-        names = group.observables or on_boards
-        declared.append((group, _on_observables(model, names)))
+        tables = _TABLES.get(group.name)
+        on_state = [] if tables is None else list(_on_state(model, base, tables(dataset)))
+        declared.append((group, [*on_state, *_on_observables(model, group.observables or on_boards, used)]))
     found = []
-    for group, columns in declared:
-        kept = _strongest(gaussian.whiten(columns[where]), columns, group.largest)
-        if kept.shape[1]:
-            found.append(
-                Group(
-                    group.name, kept[where], group.everyday, group.unit, group.source, group.largest, kept[~where]
-                )
-            )  # fmt: skip
+    for group, processes in declared:
+        if processes:
+            white = gaussian.whiten(np.column_stack([p.columns[where] for p in processes]))
+            found += list(_groups_of_state(group, processes, white, where))
     return tuple(found)
+
+
+def _groups_of_state(
+    declared: GroupDeclaration, processes: Sequence[_Columns], white: FloatArray, used: np.ndarray
+) -> Iterator[Group]:
+    """Yield what is everyday on a state, of all processes together, and each process by itself, which is unlisted.
+    `white`: their columns at the `used` numbers, whitened."""
+    name, unit, source = declared.name, declared.unit, declared.source
+    vectors = _strongest(white, _EVERYDAY_MOST * declared.everyday, MOST_COLUMNS)
+    if vectors.shape[1]:
+        kept = np.column_stack([p.columns for p in processes]) @ vectors
+        yield Group(name, kept[used], declared.everyday, unit, source, 0.0, kept[~used])
+    first = 0
+    for p in processes:
+        count = p.columns.shape[1]
+        own = _strongest(white[:, first : first + count], declared.largest, p.most)
+        first += count
+        if own.shape[1]:
+            kept = p.columns @ own
+            process = Process(p.factor @ own, p.factor @ (np.eye(count) - own @ own.T) @ p.factor.T, p.curve)
+            yield Group(
+                name, kept[used], 0.0, unit, source, declared.largest, kept[~used], process, 3.0 * declared.everyday
+            )  # fmt: skip
 
 
 def _is_of_boards(model: MeasurementModel, name: str) -> bool:
     return any(b.measurement.name == name and b.measurement.order >= 500 for b in model.blocks)
 
 
-def _strongest(white: FloatArray, columns: FloatArray, largest: float) -> FloatArray:
-    """Return the principal directions of a group that may change the numbers beyond their noise."""
-    if not columns.shape[1]:
-        return columns
+def _strongest(white: FloatArray, largest: float, most: int) -> FloatArray:
+    """Return the principal directions (R, r), `most` at most, of columns (n, R) that may change the numbers beyond
+    their noise at a scale `largest`."""
     size, vectors = eigh(white.T @ white)
-    kept = np.flatnonzero(largest**2 * size > LEAST_VARIANCE)[-MOST_COLUMNS:]
-    return np.asarray(columns @ vectors[:, kept])
+    kept = np.flatnonzero(largest**2 * size > LEAST_VARIANCE)[-most:]
+    return np.asarray(vectors[:, kept])
 
 
 @dataclass(frozen=True)
-class _SmoothChange:
-    """One process: a law with the value `v` at node k and none at the others, its nodes, and the unit in which it
-    varies by 1."""
+class _Columns:
+    """Columns (n, m) of one process: changes of the numbers by independent standard normal coefficients. `factor` (k,
+    m): those coefficients -> the process at its nodes. `most`: directions that are kept."""
 
-    law: Callable[[int, float], Effect]
-    nodes: int
+    columns: FloatArray
+    factor: FloatArray
+    curve: StateCurve | ObservableCurve
+    most: int
+
+
+# --- processes on states of the chain ---------------------------------------------------------------------------------
+
+#: Axes of `ModelDiscrepancy`, which turn with the frequency's direction or go with the wavelength.
+Directed = Literal["astigmatic frequency", "diagonal frequency", "chromatic frequency"]
+#: Least factor: a Gaussian process doesn't know that a quantity is positive.
+_LEAST_FACTOR = 0.02
+
+
+@dataclass(frozen=True)
+class StateCurve:
+    """A process along one axis of a state: its nodes `at`, and `unit`, by which the state changes where its value is 1.
+    A table that repeats after `period` indices has no nodes. Values of the first `fixed` nodes are none. `curves`: of
+    so many channels, one after the other."""
+
+    stage: Stage
+    along: Along | Directed
+    of: Of
+    at: tuple[float, ...]
     unit: float = 1.0
-    first: int = 0  # nodes before it are fixed
+    period: int = 0
+    fixed: int = 0
+    curves: int = 1
     correlated: float = _NODES_CORRELATED
 
+    @property
+    def nodes(self) -> int:
+        """Number of values."""
+        return self.period or self.curves * (len(self.at) - self.fixed - self.is_closed)
 
-def _columns(model: MeasurementModel, base: FloatArray, processes: Iterator[_SmoothChange]) -> Iterator[FloatArray]:
-    for process in processes:
-        own = []
-        for k in range(process.first, process.nodes):
-            law = process.law(k, _STEP * process.unit)
-            own.append((model.mean((law,)) - base) / _STEP)
+    @property
+    def is_step(self) -> bool:
+        """Whether it changes once, between two points."""
+        return self.fixed == 1 and len(self.at) == 2
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the last node is the first one again."""
+        return self.along == "angle"
+
+    @property
+    def none(self) -> float:
+        """The value of the state's law that changes nothing."""
+        if self.along in _DIRECTED:
+            return 1.0
+        return PLACES[self.stage, self.along, self.of][1]  # type: ignore[index]
+
+    @property
+    def kernel(self) -> FloatArray:
+        """Covariance of the values at a scale of 1: alike along the nodes; independent in a table."""
+        if self.period:
+            return np.eye(self.period)
+        x = np.arange(self.nodes // self.curves)
+        apart = np.abs(x[:, None] - x)
+        if self.is_closed:  # the chord, so that the kernel is positive definite
+            apart = len(x) / np.pi * np.sin(np.pi * apart / len(x))
+        own = np.exp(-0.5 * np.square(apart / self.correlated)) + 1e-6 * np.eye(len(x))
+        return np.kron(np.eye(self.curves), own)
+
+    def change(self, values: FloatArray) -> FloatArray:
+        """Return the departures from no change at all points of the law, given the values (nodes,)."""
+        change = self.unit * values
+        if self.is_closed:
+            return np.append(change, change[0])
+        return np.concatenate([np.zeros(self.fixed), change])
+
+    def law(self, values: FloatArray) -> Effect:
+        """Return the effect that acts on the state so. Factors stay positive; what is added to a variance is 0 at
+        least."""
+        change = self.change(values)
+        if self.along in _DIRECTED:
+            factor = np.maximum(1.0 + change, _LEAST_FACTOR)
+            curve = {"at": self.at, "factor": tuple(factor.tolist()), "strength": 1.0}
+            return ModelDiscrepancy.model_validate({"along": _DIRECTED[self.along]} | curve)
+        table = np.maximum(1.0 + change, _LEAST_FACTOR) if self.none == 1.0 else change
+        if self.of != "mean" and self.none == 0.0:
+            table = table - min(float(table.min()), 0.0)
+        if self.period and self.none == 1.0:
+            table = table / table.mean()
+        return EmpiricalLaw(
+            stage=self.stage, along=self.along, of=self.of, period=self.period, at=self.at,  # type: ignore[arg-type]
+            table=tuple(table.tolist()), strength=1.0,
+        )  # fmt: skip
+
+
+_DIRECTED: dict[str, str] = {
+    "astigmatic frequency": "astigmatic_frequency_cy_per_um",
+    "diagonal frequency": "diagonal_frequency_cy_per_um",
+    "chromatic frequency": "chromatic_frequency_cy_per_um",
+}
+
+
+@dataclass(frozen=True)
+class BordersCurve(StateCurve):
+    """The exponent of a screen's light by its drive, at widths `at` of the borders of cells, px."""
+
+    @property
+    def none(self) -> float:
+        """The exponent that changes nothing."""
+        return 1.0
+
+    def law(self, values: FloatArray) -> Effect:
+        """Return the screen of the width at which the exponent departs most."""
+        k = int(np.argmax(np.abs(values)))
+        return ScreenGamma(exponent=1.0 + float(values[k]), rim_px=self.at[k])
+
+
+def _on_state(model: MeasurementModel, base: FloatArray, curves: Iterator[StateCurve]) -> Iterator[_Columns]:
+    for curve in curves:
+        own = [(model.mean((curve.law(_STEP * one),)) - base) / _STEP for one in np.eye(curve.nodes)]
         table = np.column_stack(own)
         if table.any():
-            x = np.arange(table.shape[1])
-            kernel = np.exp(-0.5 * np.square((x[:, None] - x) / process.correlated)) + 1e-6 * np.eye(len(x))
-            yield table @ np.linalg.cholesky(kernel)
+            factor = np.asarray(np.linalg.cholesky(curve.kernel), float)
+            yield _Columns(table @ factor, factor, curve, max(MOST_COLUMNS, curve.period))
 
 
-def _curve(
-    stage: Stage, along: Along, of: Of, at: Sequence[float] | FloatArray, unit: float = 1.0, first: int = 0
-) -> _SmoothChange:
-    """Return the process of a curve of `EmpiricalLaw` with its points at `at`."""
-    none = PLACES[stage, along, of][1]
-    points = tuple(float(x) for x in at)
-
-    def law(k: int, value: float) -> Effect:
-        table = [none] * len(points)
-        table[k] = none + value
-        return EmpiricalLaw(stage=stage, along=along, of=of, at=points, table=tuple(table), strength=1.0)
-
-    return _SmoothChange(law, len(points), unit, first)
+def _points(at: Sequence[float] | FloatArray) -> tuple[float, ...]:
+    return tuple(float(x) for x in at)
 
 
-def _directed(shape: str, at: Sequence[float]) -> _SmoothChange:
-    def law(k: int, value: float) -> Effect:
-        factor = [1.0] * len(at)
-        factor[k] += value
-        curve = {"at": tuple(at), "factor": tuple(factor), "strength": 1.0}
-        return ModelDiscrepancy.model_validate({"along": f"{shape}_frequency_cy_per_um"} | curve)
-
-    return _SmoothChange(law, len(at), first=1)
-
-
-def _transfer(dataset: Dataset) -> Iterator[_SmoothChange]:
-    at = (np.array(_TRANSFER_NODES) / dataset.camera.pixel_pitch_um).tolist()
-    yield _curve("image", "frequency", "mean", at, first=1)
-    for shape in ("astigmatic", "diagonal", "chromatic"):
-        yield _directed(shape, at)
-
-
-def _field(dataset: Dataset) -> Iterator[_SmoothChange]:
+def _corner_um(dataset: Dataset) -> float:
     camera = dataset.camera
-    corner_um = 0.5 * camera.pixel_pitch_um * float(np.hypot(camera.rows, camera.cols))
-    yield _curve("image", "radius", "mean", np.linspace(0.0, corner_um, 5))
-    yield _curve("image", "angle", "mean", np.linspace(0.0, 360.0, 9))
+    return 0.5 * camera.pixel_pitch_um * float(np.hypot(camera.rows, camera.cols))
 
 
-def _spectral(dataset: Dataset) -> Iterator[_SmoothChange]:
-    stated = [c.wavelength_nm for c in dataset.recordings.captures("narrowband", dataset.side)]
-    low, high = (min(stated), max(stated)) if stated else (400.0, 700.0)
+def _transfer(dataset: Dataset) -> Iterator[StateCurve]:
+    at = _points(np.array(_TRANSFER_NODES) / dataset.camera.pixel_pitch_um)
+    yield StateCurve("image", "frequency", "mean", at, fixed=1)
+    for along in get_args(Directed):
+        yield StateCurve("image", along, "mean", at, fixed=1)
+
+
+def _field(dataset: Dataset) -> Iterator[StateCurve]:
+    corner_um = _corner_um(dataset)
+    yield StateCurve("image", "radius", "mean", _points(np.linspace(0.0, corner_um, _RADII)))
+    yield StateCurve("image", "angle", "mean", _points(np.linspace(0.0, 360.0, _ANGLES + 1)))
+    exposures = _exposures_s(dataset, ("flat",))
+    if exposures:
+        at = _points(np.linspace(0.0, corner_um, _RADII))
+        yield StateCurve("charge", "radius x exposure", "mean", at, unit=exposures[0])
+
+
+def _spectral(dataset: Dataset) -> Iterator[StateCurve]:
+    low, high = _range_nm(dataset)
     nodes = int(np.clip((high - low) / _SPECTRAL_STEP_NM, 4, _MOST_SPECTRAL)) + 1
-    curve = _curve("image", "wavelength", "mean", np.linspace(low, high, nodes))
-    yield replace(curve, correlated=_SPECTRAL_CORRELATED)
+    at = _points(np.linspace(low, high, nodes))
+    yield StateCurve("image", "wavelength", "mean", at, correlated=_SPECTRAL_CORRELATED)
 
 
-def _levels_e(dataset: Dataset) -> FloatArray:
-    return np.geomspace(0.01, 1.0, 7) * dataset.camera.full_well_e
+def _lines_nm(dataset: Dataset) -> Iterator[StateCurve]:
+    low, high = _range_nm(dataset)
+    nodes = int(np.clip((high - low) / _SPECTRAL_STEP_NM, 4, _MOST_SPECTRAL)) + 1
+    at = _points(np.linspace(low, high, nodes))
+    yield StateCurve("light", "wavelength", "mean", at, correlated=_SPECTRAL_CORRELATED)
 
 
-def _response(dataset: Dataset) -> Iterator[_SmoothChange]:
-    yield _curve("signal", "level", "mean", _levels_e(dataset).tolist())
-    exposures = sorted({float(c.exposure_s) for c in dataset.recordings.captures("flat", dataset.side)})
+def _range_nm(dataset: Dataset) -> tuple[float, float]:
+    stated = [c.wavelength_nm for c in dataset.recordings.captures("narrowband", dataset.side)]
+    return (min(stated), max(stated)) if stated else (400.0, 700.0)
+
+
+def _levels_e(dataset: Dataset) -> tuple[float, ...]:
+    return _points(np.geomspace(0.01, 1.0, 7) * dataset.camera.full_well_e)
+
+
+def _exposures_s(dataset: Dataset, kinds: Sequence[str]) -> list[float]:
+    """Return the exposures of captures of these kinds, ascending."""
+    found = {float(c.exposure_s) for kind in kinds for c in dataset.recordings.captures(kind, dataset.side)}
+    return sorted(e for e in found if e > 0.0)
+
+
+def _response(dataset: Dataset) -> Iterator[StateCurve]:
+    yield StateCurve("signal", "level", "mean", _levels_e(dataset))
+    exposures = _exposures_s(dataset, ("flat",))
     if len(exposures) > 1:
         at = np.geomspace(max(exposures[0], 1e-6), exposures[-1], min(len(exposures), 6))
-        yield _curve("charge", "exposure", "mean", at.tolist())
+        yield StateCurve("charge", "exposure", "mean", _points(at))
 
 
-def _times_s(dataset: Dataset) -> FloatArray:
-    times = sorted({dataset.elapsed_s(c) for c in dataset.recordings.captures(side=dataset.side)})
-    return np.linspace(0.0, max(times[-1], 1.0), 7)
+def _times_s(dataset: Dataset, most: int, kinds: Sequence[str | None] = (None,)) -> tuple[float, ...]:
+    """Return the times of captures of these kinds (None: all), so many of them at most."""
+    captures = (c for kind in kinds for c in dataset.recordings.captures(kind, dataset.side))
+    times = sorted({dataset.elapsed_s(c) for c in captures}) or [0.0]
+    few = np.unique(np.linspace(0, len(times) - 1, most).round().astype(int))
+    return _points(np.array(times)[few]) if len(few) > 1 else (0.0, max(times[-1], 1.0))
 
 
-def _source(dataset: Dataset) -> Iterator[_SmoothChange]:
-    yield _curve("light", "time", "mean", _times_s(dataset))
+def _steps(stage: Stage, at: Sequence[float], unit: float = 1.0) -> Iterator[StateCurve]:
+    """Yield a step in time between each two of some captures: a process of one value."""
+    for before, after in pairwise(at):
+        yield StateCurve(stage, "time", "mean", (before, after), unit, fixed=1)
 
 
-def _offset(dataset: Dataset) -> Iterator[_SmoothChange]:
-    camera = dataset.camera
-    unit = camera.read_noise_e
-    corner_um = 0.5 * camera.pixel_pitch_um * float(np.hypot(camera.rows, camera.cols))
-    yield _curve("signal", "time", "mean", _times_s(dataset), unit)
-    yield _curve("signal", "radius", "mean", np.linspace(0.0, corner_um, 4), unit)
-    for line in ("row", "column"):
-        yield _curve("signal", line, "mean", np.linspace(0.0, 1.0, 6), unit)
+def _source(dataset: Dataset) -> Iterator[StateCurve]:
+    lit = ("flat", "narrowband")
+    yield StateCurve("light", "time", "mean", _times_s(dataset, _MOST_TIMES, lit))
+    yield from _steps("light", _times_s(dataset, _MOST_STEPS, lit))
+    if len(dataset.channels) > 1:
+        at = _times_s(dataset, _FEW_TIMES, lit)
+        yield StateCurve("light", "plane x time", "mean", at, curves=len(dataset.channels))
 
 
-def _shot(dataset: Dataset) -> Iterator[_SmoothChange]:
-    yield _curve("charge", "level", "variance", _levels_e(dataset).tolist())
+def _offset(dataset: Dataset) -> Iterator[StateCurve]:
+    unit, corner_um = dataset.camera.read_noise_e, _corner_um(dataset)
+    yield StateCurve("signal", "time", "mean", _times_s(dataset, _MOST_TIMES), unit)
+    yield from _steps("signal", _times_s(dataset, _MOST_STEPS), unit)
+    yield StateCurve("signal", "radius", "mean", _points(np.linspace(0.0, corner_um, _RADII)), unit)
+    yield StateCurve("signal", "row", "mean", _points(np.linspace(0.0, 1.0, 6)), unit)
+    yield StateCurve("signal", "column", "mean", _points(np.linspace(0.0, 1.0, 6)), unit)
+    exposures = _exposures_s(dataset, ("dark", "flat"))
+    if len(exposures) > 2:
+        few = np.unique(np.linspace(0, len(exposures) - 1, _MOST_EXPOSURES).round().astype(int))
+        yield StateCurve("signal", "exposure", "mean", _points(np.array(exposures)[few]), unit)
+        at = _points(np.linspace(0.0, corner_um, _RADII))
+        yield StateCurve("charge", "radius", "mean", at, unit / exposures[-1])
 
 
-def _borders(_dataset: Dataset) -> Iterator[_SmoothChange]:
-    yield _SmoothChange(lambda k, value: ScreenGamma(exponent=1.0 + value, rim_px=_RIMS_PX[k]), len(_RIMS_PX))
+def _shot(dataset: Dataset) -> Iterator[StateCurve]:
+    yield StateCurve("charge", "level", "variance", _levels_e(dataset))
 
 
-_ON_STATES: dict[GroupDeclaration, Callable[[Dataset], Iterator[_SmoothChange]]] = {
-    TRANSFER: _transfer, FIELD: _field, SPECTRAL: _spectral, RESPONSE: _response, SOURCE: _source, OFFSET: _offset,
-    SHOT: _shot, BORDERS: _borders,
+def _borders(_dataset: Dataset) -> Iterator[StateCurve]:
+    yield BordersCurve("light", "level", "mean", _RIMS_PX)
+
+
+def _rows_that_repeat(_dataset: Dataset) -> Iterator[StateCurve]:
+    yield StateCurve("charge", "row", "mean", (), period=mosaic.PERIOD_PX)
+
+
+def _codes_that_repeat(_dataset: Dataset) -> Iterator[StateCurve]:
+    yield StateCurve("codes", "code", "mean", (), period=_CODES_PERIOD)
+
+
+_ON_STATES: dict[GroupDeclaration, Callable[[Dataset], Iterator[StateCurve]]] = {
+    TRANSFER: _transfer, FIELD: _field, SPECTRAL: _spectral, LINES: _lines_nm, RESPONSE: _response, SOURCE: _source,
+    OFFSET: _offset, SHOT: _shot, ROWS: _rows_that_repeat, BORDERS: _borders,
 }  # fmt: skip
+#: Tables that repeat, on states of groups whose other processes act on observables, by name.
+_TABLES: dict[str, Callable[[Dataset], Iterator[StateCurve]]] = {"codes": _codes_that_repeat}
 
 
-def _on_observables(model: MeasurementModel, names: Sequence[str]) -> FloatArray:
-    """Columns of processes along the axes of these observables, each by itself; one process for the numbers that are
-    used and those that are held out."""
+# --- processes on observables -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ObservableCurve:
+    """A process along the axis of one observable, as a share of its numbers' scale. Its nodes are the numbers: those
+    that are used, `used` of them, and those that are held out. `scale` (k,)."""
+
+    measurement: Measurement
+    labels: tuple[Label, ...]
+    scale: FloatArray
+    used: int
+
+
+def _on_observables(model: MeasurementModel, names: Sequence[str], used: int) -> Iterator[_Columns]:
+    """Yield processes along the axes of these observables, each by itself; one process for the numbers that are used
+    and those that are held out."""
     n = len(model.value)
-    columns = []
     for name in names:
         at = [k for k, block in enumerate(model.blocks) if block.measurement.name == name]
-        if at:
-            blocks = [model.blocks[k] for k in at]
-            size, vectors = eigh(observable_kernel(*blocks))
-            kept = np.flatnonzero(size > 1e-3 * size[-1])[-2 * MOST_COLUMNS :]
-            own = np.zeros((n, len(kept)))
-            scale = np.concatenate([b.scale for b in blocks])
-            where = np.concatenate([np.arange(n)[model.slices[k]] for k in at])
-            own[where] = scale[:, None] * vectors[:, kept] * np.sqrt(size[kept])
-            columns.append(own)
-    return np.concatenate(columns, axis=1) if columns else np.zeros((n, 0))
+        if not at:
+            continue
+        blocks = [model.blocks[k] for k in at]
+        size, vectors = eigh(observable_kernel(*blocks))
+        kept = np.flatnonzero(size > 1e-3 * size[-1])[-2 * MOST_COLUMNS :]
+        factor = vectors[:, kept] * np.sqrt(size[kept])
+        scale = np.concatenate([b.scale for b in blocks])
+        where = np.concatenate([np.arange(n)[model.slices[k]] for k in at])
+        own = np.zeros((n, len(kept)))
+        own[where] = scale[:, None] * factor
+        labels = tuple(label for b in blocks for label in b.labels)
+        curve = ObservableCurve(blocks[0].measurement, labels, scale, int(np.sum(where < used)))
+        yield _Columns(own, factor, curve, MOST_ON_OBSERVABLE)
 
 
 def observable_kernel(*blocks: Observable) -> FloatArray:

@@ -106,10 +106,15 @@ class Coordinate:
 class Alternative:
     """Signatures of a hypothesis for one value of its shapes and choices: instances whose changes of the prediction
     may be combined with coefficients >= 0, and the prior scale of each coefficient. Where two instances are of opposite
-    sign of one parameter, each has half of the prior."""
+    sign of one parameter, each has half of the prior.
+
+    `is_whole`: one instance without a size, which acts as a whole or not at all: its coefficient is 1. `log_share`: log
+    of the alternative's prior probability over that of one of equally probable alternatives."""
 
     points: tuple[Point, ...]
     scales: tuple[float, ...]
+    is_whole: bool = False
+    log_share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -139,8 +144,8 @@ class Hypothesis:
 # --- The prior of sets ------------------------------------------------------------------------------------------------
 
 #: Probabilities of 0, 1, 2, ... active hypotheses on a side: half of the cameras do as their data sheet says; of the
-#: others each further cause is two and a half times rarer.
-NUMBER = (0.5, 0.3, 0.12, 0.05, 0.02, 0.01)
+#: others each further cause is two to three times rarer. A camera that is looked at closely shows more than five.
+NUMBER = (0.5, 0.3, 0.12, 0.05, 0.02, 0.006, 0.0025, 0.001, 0.0005)
 
 
 @dataclass(frozen=True)
@@ -301,9 +306,12 @@ def point_of(effect: Effect, camera: CameraModel) -> Point:
 
 
 def effect_at(point: Point, parameters: Sequence[EffectParameter]) -> Effect:
-    """Return the effect of a point: its template with the parameters of u."""
-    values = {p.name: p.to_value(float(u)) for p, u in zip(parameters, point.u, strict=True)}
+    """Return the effect of a point: its template with the parameters of u, itself at its own u. A value isn't bit for
+    bit that of its u, and would be predicted anew."""
     template: Effect = point.template
+    if all(p.to_u(float(getattr(template, p.name))) == u for p, u in zip(parameters, point.u, strict=True)):
+        return template
+    values = {p.name: p.to_value(float(u)) for p, u in zip(parameters, point.u, strict=True)}
     return template.replace_fields(**values)
 
 

@@ -13,7 +13,7 @@ cameras: `camera.py` binds it to a recording set, a test to a toy."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -65,11 +65,27 @@ class Model(Protocol):
 
 
 @dataclass(frozen=True)
-class Group:
-    """One group of delta: its columns H (n, r) at tau = 1, and its everyday scale s_g, in the same unit.
+class Process:
+    """One Gaussian process of a group: its values f (k,) at its nodes, given the coefficients d (r,) of the group's
+    columns, d ~ N(0, tau^2):
 
-    `everyday`: tau is half-normal with this standard deviation. Unlisted physics has tau log-uniform from 3 `everyday`
-    to `largest`."""
+        f = values d + f',   f' ~ N(0, tau^2 rest)
+
+    f' is what the numbers don't show. `curve`: what the nodes are; None in a toy."""
+
+    values: FloatArray  # (k, r)
+    rest: FloatArray  # (k, k)
+    curve: Any = None
+
+
+@dataclass(frozen=True)
+class Group:
+    """Columns H (n, r) of delta that share one scale, at tau = 1, and the state of the chain that they act on (`name`).
+
+    `everyday`: s_g; tau is half-normal with this standard deviation, in the same unit. 0: there is none but where it is
+    unlisted. Unlisted physics has tau log-uniform from `least` to `largest`; 0: it is never unlisted. What is unlisted
+    acts along one axis of a state: of each state, one group holds everything that is everyday, and each process is a
+    group of its own, which is there where it is unlisted."""
 
     name: str
     columns: FloatArray
@@ -78,19 +94,34 @@ class Group:
     source: str = ""
     largest: float = 1.0
     held_out: FloatArray | None = None  # the same columns at the held-out numbers, (n*, r)
+    process: Process | None = None
+    least: float | None = None  # None: 3 `everyday`
+
+    @property
+    def may_be_unlisted(self) -> bool:
+        """Whether unlisted physics may act so."""
+        return self.largest > 0.0
+
+    def varies(self, unlisted: bool) -> bool:
+        """Whether tau has more than one value."""
+        return unlisted or self.everyday > 0.0
 
     def scales(self, unlisted: bool) -> FloatArray:
         """Return the points of tau at which it is integrated: medians of shares of the prior (`shares`)."""
+        if not self.varies(unlisted):
+            return np.zeros(1)
         edges = np.concatenate([[0.0], np.cumsum(self.shares(unlisted))])
         middle = 0.5 * (edges[:-1] + edges[1:])
         if not unlisted:
             return self.everyday_quantile(middle)
-        low, high = np.log(3.0 * self.everyday), np.log(self.largest)
+        low, high = np.log(3.0 * self.everyday if self.least is None else self.least), np.log(self.largest)
         return np.exp(low + middle * (high - low))
 
     def shares(self, unlisted: bool) -> FloatArray:
         """Return the prior probabilities of the points. Everyday ones are closer in the tail: of a dozen groups that
         the numbers determine well, one lies there."""
+        if not self.varies(unlisted):
+            return np.ones(1)
         return np.full(SCALES, 1.0 / SCALES) if unlisted else EVERYDAY_SHARES
 
     def everyday_quantile(self, share: FloatArray) -> FloatArray:
@@ -154,10 +185,8 @@ def everyday_scales(groups: Sequence[Group]) -> FloatArray:
 
 
 def scaled_columns(groups: Sequence[Group], tau: FloatArray, n: int) -> FloatArray:
-    """Columns of all groups times their tau, (n, R)."""
-    if not groups:
-        return np.zeros((n, 0))
-    return np.column_stack([t * g.columns for g, t in zip(groups, tau, strict=True)])
+    """Columns of all groups that are there times their tau, (n, R)."""
+    return np.column_stack([np.zeros((n, 0)), *(t * g.columns for g, t in zip(groups, tau, strict=True) if t > 0.0)])
 
 
 @dataclass(frozen=True)
@@ -177,7 +206,7 @@ class ScaleIntegral:
     group_sizes: tuple[int, ...]
     precision: FloatArray
     groups: tuple[Group, ...]
-    prior_log: tuple[float, float]  # log prior of u_g = 0 and of u_g = 1, of each group
+    prior_log: FloatArray  # log prior of u_g = 0 and of u_g = 1, of each group, (2, G)
     _known: dict[bytes, float] = field(default_factory=dict)
 
     @classmethod
@@ -199,30 +228,33 @@ class ScaleIntegral:
         projected[len(projected) - len(pull) :] += pull
         return cls(
             table.T @ table, projected, tuple(g.columns.shape[1] for g in groups), precision, tuple(groups),
-            cls.log_priors(len(groups), any_unlisted),
+            cls.log_priors(groups, any_unlisted),
         )  # fmt: skip
 
     @staticmethod
-    def log_priors(groups: int, any_unlisted: float) -> tuple[float, float]:
-        """Return the log prior of u_g = 0 and of u_g = 1 of each of so many groups."""
-        one = 1.0 - (1.0 - any_unlisted) ** (1.0 / max(groups, 1))
-        return float(np.log1p(-one)), float(np.log(one))
-
-    def log_det(self, tau: FloatArray) -> float:
-        """1/2 log det of 1 + amplitude M amplitude of the groups alone at these scales (G,)."""
-        amplitude = np.repeat(tau, self.group_sizes)
-        inner = np.eye(len(amplitude)) + amplitude[:, None] * self.gram[: len(amplitude), : len(amplitude)] * amplitude
-        return float(np.log(np.diag(np.linalg.cholesky(inner))).sum())
+    def log_priors(groups: Sequence[Group], any_unlisted: float) -> FloatArray:
+        """Return the log prior of u_g = 0 and of u_g = 1 of each group, (2, G): equal for all states, and for all
+        groups of a state."""
+        able = [g.name for g in groups if g.may_be_unlisted]
+        one = 1.0 - (1.0 - any_unlisted) ** (1.0 / max(len(set(able)), 1))
+        share = {name: 1.0 / able.count(name) for name in able}
+        with np.errstate(divide="ignore"):
+            return np.array([
+                [np.log1p(-one) * share.get(g.name, 0.0) if g.may_be_unlisted else 0.0 for g in groups],
+                [np.log(one * share[g.name]) if g.may_be_unlisted else -np.inf for g in groups],
+            ]).reshape(2, len(groups))  # fmt: skip
 
     def log_likelihood(self, tau: FloatArray) -> float:
         """Log marginal likelihood at these scales (G,), up to a constant of the set."""
         key = tau.tobytes()
         if key not in self._known:
             amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
-            inner = amplitude[:, None] * self.gram * amplitude
+            there = np.flatnonzero(amplitude)
+            amplitude = amplitude[there]
+            inner = amplitude[:, None] * self.gram[np.ix_(there, there)] * amplitude
             split = len(amplitude) - len(self.precision)
             inner[np.diag_indices_from(inner)] += np.concatenate([np.ones(split), self.precision])
-            b = amplitude * self.projected
+            b = amplitude * self.projected[there]
             factor = cho_factor(inner, lower=True, check_finite=False)
             log_det = 2.0 * float(np.log(np.diag(factor[0])).sum())
             self._known[key] = 0.5 * float(b @ cho_solve(factor, b, check_finite=False)) - 0.5 * log_det
@@ -239,7 +271,7 @@ class ScaleIntegral:
         ends = np.cumsum(self.group_sizes)
         own = np.zeros(len(amplitude), bool)
         own[ends[g] - self.group_sizes[g] : ends[g]] = True
-        rest = ~own
+        rest = ~own & (amplitude > 0.0)
         scale = amplitude[rest]
         inner = scale[:, None] * self.gram[np.ix_(rest, rest)] * scale
         inner[np.diag_indices_from(inner)] += np.concatenate(
@@ -263,59 +295,105 @@ class ScaleIntegral:
         t2 = np.square(points)[:, None]
         return np.asarray(total + 0.5 * ((t2 / (1.0 + t2 * size)) @ power - np.log1p(t2 * size).sum(1)[:, None]))
 
+    def profiles_of_processes(self, tau: FloatArray, projected: FloatArray) -> Iterator[tuple[int, FloatArray]]:
+        """Yield each group that is there only where it is unlisted, with its gain of log marginal likelihood at the
+        points of its scale (k, m) for m residuals, given their W'r (R + p, m) and the scales of the others: one
+        factorisation for all."""
+        which = [g for g, group in enumerate(self.groups) if group.may_be_unlisted and not group.varies(False)]
+        amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
+        there = np.flatnonzero(amplitude)
+        scale, split = amplitude[there], len(amplitude) - len(self.precision)
+        inner = scale[:, None] * self.gram[np.ix_(there, there)] * scale
+        inner[np.diag_indices_from(inner)] += np.concatenate([np.ones(split), self.precision])[there]
+        factor = cho_factor(inner, lower=True, check_finite=False) if len(there) else None
+        right = np.zeros((0, projected.shape[1]))
+        if factor is not None:
+            right = cho_solve(factor, scale[:, None] * projected[there], check_finite=False)
+        ends = np.cumsum(self.group_sizes)
+        for g in which:
+            own = np.arange(ends[g] - self.group_sizes[g], ends[g])
+            across = scale[:, None] * self.gram[np.ix_(there, own)]
+            left = across if factor is None else cho_solve(factor, across, check_finite=False)
+            size, vectors = eigh(self.gram[np.ix_(own, own)] - across.T @ left)
+            size, power = np.maximum(size, 0.0), np.square(vectors.T @ (projected[own] - across.T @ right))
+            t2 = np.square(self.groups[g].scales(True))[:, None]
+            yield g, 0.5 * ((t2 / (1.0 + t2 * size)) @ power - np.log1p(t2 * size).sum(1)[:, None])
+
     def _swept(self, tau: FloatArray, which: Iterable[int], unlisted: frozenset[int]) -> FloatArray:
         """Return the scales with each of `which` moved to its likeliest point, the others as they are."""
         tau = tau.copy()
         for g in which:
             points = self.groups[g].scales(g in unlisted)
             weight = np.log(self.groups[g].shares(g in unlisted))
-            tau[g] = points[int(np.argmax(self.profile(g, tau, points) + weight))]
+            values = self.profile(g, tau, points) if len(points) > 1 else np.zeros(1)
+            tau[g] = points[int(np.argmax(values + weight))]
         return tau
 
     def integrated(self, tau: FloatArray, unlisted: frozenset[int]) -> float:
         """Log marginal likelihood with every tau integrated over its points, by one-dimensional integrals about
         `tau`, a mode along each coordinate."""
-        at = self.log_likelihood(tau)
-        points = [group.scales(g in unlisted) for g, group in enumerate(self.groups)]
-        shares = [group.shares(g in unlisted) for g, group in enumerate(self.groups)]
-        return at + sum(
-            log_mean(self.profile(g, tau, p), w) - at for g, (p, w) in enumerate(zip(points, shares, strict=True))
-        )
+        at = total = self.log_likelihood(tau)
+        for g, group in enumerate(self.groups):
+            if group.varies(g in unlisted):
+                points, shares = group.scales(g in unlisted), group.shares(g in unlisted)
+                total += log_mean(self.profile(g, tau, points), shares) - at
+        return total
+
+    @cached_property
+    def _everyday_groups(self) -> list[int]:
+        return [g for g, group in enumerate(self.groups) if group.varies(False)]
 
     @cached_property
     def everyday_mode(self) -> FloatArray:
         """The likeliest everyday scales (G,)."""
         tau = everyday_scales(self.groups)
         for _ in range(2):
-            tau = self._swept(tau, range(len(self.groups)), frozenset())
+            tau = self._swept(tau, self._everyday_groups, frozenset())
         return tau
 
     @cached_property
     def everyday(self) -> float:
         """Log marginal likelihood with all groups everyday."""
-        return self.integrated(self.everyday_mode, frozenset())
+        return self._flips[0]
+
+    @cached_property
+    def _flips(self) -> tuple[float, dict[int, float]]:
+        """Log marginal likelihood with all groups everyday, and what it gains by each group's flip, the scales of the
+        others as without: a lower bound of the gain."""
+        tau, flips = self.everyday_mode, dict[int, float]()
+        at = everyday = self.log_likelihood(tau)
+        for g, gains in self.profiles_of_processes(tau, self.projected[:, None]):
+            flips[g] = log_mean(gains[:, 0], self.groups[g].shares(True))
+        for g in self._everyday_groups:
+            group = self.groups[g]
+            usual, other = group.scales(False), group.scales(True) if group.may_be_unlisted else np.zeros(0)
+            values = self.profile(g, tau, np.concatenate([usual, other]))
+            usual_log = log_mean(values[: len(usual)], group.shares(False))
+            everyday += usual_log - at
+            if group.may_be_unlisted:
+                flips[g] = log_mean(values[len(usual) :], group.shares(True)) - usual_log
+        return everyday, flips
 
     @cached_property
     def quick(self) -> float:
         """Log marginal likelihood over no and single flips, the scales of the others as without: a lower bound."""
-        tau, none = self.everyday_mode, frozenset[int]()
-        at, flips, everyday = self.log_likelihood(tau), [], self.log_likelihood(tau)
-        for g, group in enumerate(self.groups):
-            usual, other = group.scales(False), group.scales(True)
-            values = self.profile(g, tau, np.concatenate([usual, other]))
-            usual_log = log_mean(values[: len(usual)], group.shares(False))
-            other_log = log_mean(values[len(usual) :], group.shares(True))
-            everyday += usual_log - at
-            flips.append(other_log - usual_log + self.log_prior(frozenset((g,))))
-        return everyday + log_sum_exp([self.log_prior(none), *flips])
+        everyday, flips = self._flips
+        priors = [gain + self.log_prior(frozenset((g,))) for g, gain in flips.items()]
+        return everyday + log_sum_exp([self.log_prior(frozenset()), *priors])
 
     def mode(self, unlisted: frozenset[int]) -> FloatArray:
         """The likeliest scales (G,) with these groups unlisted."""
         if not unlisted:
             return self.everyday_mode
-        tau = self._swept(self.everyday_mode, sorted(unlisted), unlisted)
-        others = [g for g in range(len(self.groups)) if g not in unlisted]
-        return self._swept(self._swept(tau, others, unlisted), sorted(unlisted), unlisted)
+        if unlisted not in self._modes:
+            tau = self._swept(self.everyday_mode, sorted(unlisted), unlisted)
+            others = [g for g in self._everyday_groups if g not in unlisted]
+            self._modes[unlisted] = self._swept(self._swept(tau, others, unlisted), sorted(unlisted), unlisted)
+        return self._modes[unlisted]
+
+    @cached_property
+    def _modes(self) -> dict[frozenset[int], FloatArray]:
+        return {}
 
     def stratified(self, unlisted: frozenset[int], count: int) -> FloatArray:
         """Return scales (count, G) of their posterior with these groups unlisted: a Latin hypercube of the quantiles of
@@ -324,6 +402,8 @@ class ScaleIntegral:
         rng = np.random.default_rng(0)
         found = np.tile(tau, (count, 1))
         for g, group in enumerate(self.groups):
+            if not group.varies(g in unlisted):
+                continue
             points = group.scales(g in unlisted)
             values = self.profile(g, tau, points)
             weight = group.shares(g in unlisted) * np.exp(values - values.max())
@@ -337,17 +417,19 @@ class ScaleIntegral:
 
     def log_prior(self, unlisted: frozenset[int]) -> float:
         """Log prior probability of exactly these groups being unlisted."""
-        everyday, other = self.prior_log
-        return (len(self.groups) - len(unlisted)) * everyday + len(unlisted) * other
+        is_unlisted = np.isin(np.arange(len(self.groups)), list(unlisted))
+        return float(np.where(is_unlisted, self.prior_log[1], self.prior_log[0]).sum())
 
     def weights(self, least: float = 12.0) -> dict[frozenset[int], float]:
-        """Log of p(y | A, u) p(u) of no, single and pair flips; pairs of groups that are within `least` of the best by
-        themselves."""
+        """Log of p(y | A, u) p(u) of no, single and pair flips. Of flips that are more than `least` below the best it
+        is that with the scales of the others as without; pairs are of groups that aren't, by themselves."""
         none: frozenset[int] = frozenset()
         found = {none: self.everyday + self.log_prior(none)}
-        for g in range(len(self.groups)):
+        roughly = {g: self.everyday + gain + self.log_prior(frozenset((g,))) for g, gain in self._flips[1].items()}
+        top = max([found[none], *roughly.values()])
+        for g, value in roughly.items():
             one = frozenset((g,))
-            found[one] = self.flipped(one) + self.log_prior(one)
+            found[one] = self.flipped(one) + self.log_prior(one) if value > top - least else value
         top = max(found.values())
         near = sorted((s for s in found if len(s) == 1 and found[s] > top - least), key=lambda s: -found[s])[:PAIRED]
         for i, a in enumerate(near):

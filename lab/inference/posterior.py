@@ -75,13 +75,15 @@ def read_table(table: Table, hypotheses: Mapping[str, Hypothesis]) -> Posterior:
             effects[name] = effects.get(name, 0.0) + row.probability
         for family in {hypotheses[name].family for name in row.members}:
             families[family] = families.get(family, 0.0) + row.probability
-        for g in row.unlisted:
-            unlisted[table.groups[g]] = unlisted.get(table.groups[g], 0.0) + row.probability
+        for state in table.states(row.unlisted):
+            unlisted[state] = unlisted.get(state, 0.0) + row.probability
         if not row.members and not row.unlisted:
             nothing += row.probability
     for tail in table.tails:
         for name in tail.members:
             effects[name] = effects.get(name, 0.0) + tail.probability
+        for state, share in tail.unlisted.items():
+            unlisted[state] = unlisted.get(state, 0.0) + tail.probability * share
         for name, share in tail.effects.items():
             effects[name] = effects.get(name, 0.0) + tail.probability * share
         held_families = {hypotheses[name].family for name in tail.members}

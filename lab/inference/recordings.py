@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 
 from lab.capture_kinds.base import Capture
+from lab.capture_kinds.chart import ChartCapture
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.side_model import dataset_of, measurement_model
-from lab.diagnose.metadata import Misstatement, misstatements
+from lab.diagnose.inference.side_model import any_aperture, dataset_of, measurement_model
 from lab.errors import NotDetermined
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
@@ -23,14 +23,24 @@ from lab.inference.discrepancy import groups_of, observable_kernel
 from lab.inference.hypotheses import EffectParameter, Hypothesis, SetPrior, effect_at, hypothesis_of, parameters_of
 from lab.inference.model import Group, State
 from lab.inference.search import Search, Table
+from lab.inference.statements.statement import (
+    Change,
+    Changes,
+    Numbers,
+    Restatement,
+    hypotheses_of_statements,
+    restated,
+)
 from lab.observables.dataset import Dataset
 from lab.observables.gaussian import Gaussian
-from lab.observables.observable import Observable, Prediction, measurements
+from lab.observables.observable import Label, Observable, Prediction, measurements
 from sim.camera import Side
 from sim.effects.base import Effect, Effects
 from sim.effects.library import candidates
 from sim.effects.other_f_number import OtherFNumber
+from sim.scene.colorchecker import reflectances
 from sim.spectrum import FloatArray
+from sim.uniform import electron_rate
 
 #: Standard deviations of the noise by which a usual size has to change the numbers.
 LEAST_SHOWN = 0.3
@@ -38,11 +48,14 @@ LEAST_SHOWN = 0.3
 
 @dataclass
 class SideModel:
-    """The model of one side (`lab.inference.model.Model`): effects in the place of a toy's changes."""
+    """The model of one side (`lab.inference.model.Model`): effects and wrong statements in the place of a toy's
+    changes. `numbers`: the same numbers with their captures, which statements are about; None where none is asked."""
 
     measured: MeasurementModel
     groups: Sequence[Group]
+    numbers: Numbers | None = None
     parameters: dict[str, tuple[EffectParameter, ...]] = field(default_factory=dict)
+    _prepared: dict[Restatement, Changes] = field(default_factory=dict)
 
     @property
     def value(self) -> FloatArray:
@@ -54,28 +67,48 @@ class SideModel:
         found = []
         for name in sorted(state):
             point = state[name]
+            if isinstance(point.template, Restatement):
+                continue
             if name not in self.parameters:
                 self.parameters[name] = parameters_of(type(point.template), self.measured.camera)
             found.append(effect_at(point, self.parameters[name]))
         return tuple(found)
 
+    def changes(self, state: State) -> tuple[Change, ...]:
+        """Return the changes of the prediction by the wrong statements of a state."""
+        found = []
+        for name in sorted(state):
+            point = state[name]
+            if isinstance(point.template, Restatement):
+                assert self.numbers is not None
+                if point.template not in self._prepared:
+                    self._prepared[point.template] = point.template.on(self.numbers)
+                found.append(self._prepared[point.template](point.u))
+        return tuple(found)
+
     def mean(self, state: State) -> FloatArray:
-        """m under these effects, (n,)."""
-        return self.measured.mean(self.effects(state))
+        """m under these effects and wrong statements, (n,)."""
+        mean = self.measured.mean(self.effects(state))
+        for change in self.changes(state):
+            mean = change.on_mean(mean)
+        return mean
 
     def gaussian(self, state: State, form_scale: float) -> Gaussian:
         """N(m, S + J P J'), with the form errors of the effects at `form_scale` times their tolerance.
 
         A law's error is a share of its change. It is smooth along the observable's axis, and in the logarithm of the
         change: numbers of one place that the law changes differently (in time, after other light) err differently."""
-        effects = self.effects(state)
+        effects, changes = self.effects(state), self.changes(state)
         gaussian = self.measured.gaussian(effects, None, 0.0)
+        if changes:
+            gaussian = restated(self.measured, gaussian, changes, effects)
         if form_scale == 0.0:
             return gaussian
+        stated = self.measured.mean(effects)
         for k, effect in enumerate(effects):
             if effect.form_tolerance == 0.0:
                 continue
-            change = gaussian.mean - self.measured.mean((*effects[:k], *effects[k + 1 :]))
+            change = stated - self.measured.mean((*effects[:k], *effects[k + 1 :]))
             for index in self.measured.affected_blocks(effect):
                 own = change[self.measured.slices[index]]
                 if own.any():
@@ -102,7 +135,6 @@ class SideProblem:
     dataset: Dataset
     measured: MeasurementModel
     held_out: tuple[Observable, ...]
-    misstated: tuple[Misstatement, ...]
     skipped: tuple[Skipped, ...]
 
     @cached_property
@@ -112,10 +144,32 @@ class SideProblem:
         names = self.measured.nuisance_jacobian()
         own = {n for n in names if sum(bool(c.any()) for c in self._by_block(names[n])) == 1}
         others = tuple(replace(b, predict=_with_own(b.predict, own)) for b in self.held_out)
-        return replace(
+        whole = replace(
             self.measured, blocks=(*self.measured.blocks, *others), unstated_jacobian={}, _predictions={},
             _covariances={}, _numbers={},
         )  # fmt: skip
+        if not self.measured.unstated_jacobian:
+            return whole
+        return replace(whole, unstated_jacobian=any_aperture(whole, len(self.measured.value)))
+
+    def numbers(self, model: MeasurementModel) -> Numbers:
+        """Return the numbers of a model of this side with their captures, held-out ones too."""
+        return Numbers(model, {c.id: c for c in self.dataset.in_time_order}, self.dataset.stated, self._rate)
+
+    def _rate(self, capture: Capture, label: Label, channel: str) -> float:
+        """Electrons a second on axis in the light of a narrowband or chart capture, by the baseline."""
+        known = reflectances(capture.chart) if isinstance(capture, ChartCapture) else {}
+        light = self.dataset.spectrum(str(getattr(capture, "radiance", None)))
+        reflectance = known.get(label.condition)
+        return electron_rate(self.dataset.camera, channel, light, kind=capture.kind, reflectance=reflectance)
+
+    def side_model(self, groups: Sequence[Group]) -> SideModel:
+        """Return the model of the numbers that are used."""
+        return SideModel(self.measured, groups, self.numbers(self.measured))
+
+    def whole_model(self, groups: Sequence[Group]) -> SideModel:
+        """Return the model of the numbers that are used, and of those that are held out."""
+        return SideModel(self.whole, groups, self.numbers(self.whole))
 
     def _by_block(self, column: FloatArray) -> list[FloatArray]:
         return [column[at] for at in self.measured.slices]
@@ -146,7 +200,6 @@ def measure_side(
 ) -> SideProblem | None:
     """Hold captures out, fit the others by `fit` (None: no fit), and measure both. `baseline`: a camera file in the
     place of data sheet and fit, with its effects. None where nothing can be measured."""
-    recordings, misstated = misstatements(recordings, side)
     held = held_out_ids(recordings, side)
     used = recordings.without(held)
     fitted = None if fit is None else fit(used)
@@ -155,7 +208,7 @@ def measure_side(
     model, skipped = measurement_model(used, side, fitted, baseline, dataset)
     if model is None:
         return None
-    return SideProblem(side, dataset, model, _held_out(recordings, held, dataset, order), misstated, skipped)
+    return SideProblem(side, dataset, model, _held_out(recordings, held, dataset, order), skipped)
 
 
 def _in_time_order(recordings: RecordingSet, side: Side) -> list[Capture]:
@@ -167,7 +220,9 @@ def _in_time_order(recordings: RecordingSet, side: Side) -> list[Capture]:
 
 def _with_history(dataset: Dataset, order: list[Capture]) -> Dataset:
     """Return the dataset with all of the side's captures as its history: what frames before leave in a frame doesn't
-    ask whether they are held out. Their levels predict, and aren't data."""
+    ask whether they are held out, nor does the time since the first one. Their levels predict, and aren't data."""
+    times = [c.time for c in order if c.time is not None]
+    dataset.first_time = min(times, default=None)
     dataset.in_time_order = [c for c in order if c.id not in dataset.copies.ids]
     dataset.__dict__.pop("_before", None)
     return dataset
@@ -222,9 +277,12 @@ def search_side(
     problem: SideProblem, report: Callable[[str], None] = lambda text: None, everyday: float = 1.0
 ) -> tuple[Search, Table]:
     """Run the search on one side. `everyday`: factor to all everyday scales, to see what depends on them."""
-    hypotheses = hypotheses_of(problem.measured)
-    groups = tuple(replace(group, everyday=everyday * group.everyday) for group in problem.groups)
-    model = SideModel(problem.measured, groups)
+    hypotheses = hypotheses_of(problem.measured) | hypotheses_of_statements(problem.numbers(problem.measured))
+    groups = tuple(
+        replace(g, everyday=everyday * g.everyday, least=None if g.least is None else everyday * g.least)
+        for g in problem.groups
+    )
+    model = problem.side_model(groups)
     prior = SetPrior({name: h.family for name, h in hypotheses.items()})
     search = Search(model, hypotheses, prior, report=report)
     return search, search.run()

@@ -63,8 +63,9 @@ HOPELESS = 50.0
 #: Gain of log evidence above which an estimate is made again about the largest refitted part of its set: of large
 #: changes the closed form is wrong by a share of the gain.
 HALFWAY = 5.0
-#: The most hypotheses that are tried beside the likeliest set where the best gains more than `HOPELESS`.
-SINGLES = 8
+#: Gain of log evidence from which on the closed form about a set may be wrong by more than rivals differ: a change of
+#: the prediction isn't linear then. The most hypotheses that are refitted beside that set.
+CURVED, SINGLES = 10.0, 8
 #: Refits of sets that the closed form about a set far below the likeliest promises: about such a set it isn't linear.
 DOUBTFUL = 3
 #: P(any group is unlisted) of a camera.
@@ -188,18 +189,20 @@ class Row:
 @dataclass(frozen=True)
 class Tail:
     """All sets of three or more members more than `members` of which the recordings say little, together: their
-    probability, and by hypothesis the share that holds it, by family the share that holds any of it."""
+    probability, and by hypothesis the share that holds it, by family the share that holds any of it, by group the share
+    in which something unlisted acts on a state."""
 
     members: frozenset[str]
     probability: float
     effects: Mapping[str, float]
     families: Mapping[str, float]
+    unlisted: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Table:
     """All sets with their probabilities, likeliest first, and the fits of those that were refitted. `tails`: larger
-    sets, which aren't listed one by one."""
+    sets, which aren't listed one by one. `groups`: the state of each group."""
 
     rows: tuple[Row, ...]
     tails: tuple[Tail, ...]
@@ -207,6 +210,14 @@ class Table:
     groups: tuple[str, ...]
     log_evidence: float
     refits: int
+
+    def states(self, unlisted: frozenset[int]) -> tuple[str, ...]:
+        """Return the states on which these groups act."""
+        return tuple(dict.fromkeys(self.groups[g] for g in sorted(unlisted)))
+
+    def groups_on(self, state: str) -> frozenset[int]:
+        """Return the groups that act on a state."""
+        return frozenset(g for g, name in enumerate(self.groups) if name == state)
 
     @property
     def left(self) -> float:
@@ -227,12 +238,17 @@ class Table:
 
 @dataclass(frozen=True)
 class _Estimate:
-    log_posterior: float
+    by_groups: Mapping[frozenset[int], float]  # log posterior, by which groups are unlisted
     gain: float  # of log evidence over the origin
     weight: float  # log p(y | A, u) p(u) p(A) of the origin with the unlisted groups of the estimate
     origin: frozenset[str]
     alternatives: tuple[int, ...]  # signatures, by index
     coefficients: tuple[FloatArray, ...]
+
+    @cached_property
+    def log_posterior(self) -> float:
+        """Whatever is unlisted beside it."""
+        return log_sum_exp(list(self.by_groups.values()))
 
 
 @dataclass
@@ -291,15 +307,15 @@ class Search:
         return max(self._log_posterior(f) for f in self.fits.values())
 
     def _add_strong(self) -> None:
-        """While one more hypothesis promises so much that the closed form isn't linear, refit the likeliest set with
-        each of those that promise half of what the best does."""
+        """While one more hypothesis promises so much that the closed form isn't linear (`CURVED`), refit the likeliest
+        set with each of those that promise half of what the best does."""
         while True:
             origin = max(self.fits.values(), key=self._log_posterior)
             if origin.members not in self.singles:
                 self._linearise(origin)
             gains = self.singles[origin.members]
             top = max(gains.values(), default=0.0)
-            if top < HOPELESS:
+            if top < CURVED:
                 return
             strong = sorted((n for n, gain in gains.items() if gain > 0.5 * top), key=lambda n: -gains[n])[:SINGLES]
             keys = [origin.members | {name} for name in strong]
@@ -319,7 +335,11 @@ class Search:
         losses: list[tuple[float, str]] = []
         for name in best.state:
             own = [k for k, (owner, _, c) in enumerate(places) if owner == name and not c.is_shape]
-            if not own or best.members - {name} in self.fits:
+            if best.members - {name} in self.fits:
+                continue
+            if not self.hypotheses[name].coordinates:  # it acts as a whole: how far from 0 isn't known
+                losses.append((0.0, name))
+            if not own:
                 continue
             away = stacked(best.state)[own]
             covariance = best.laplace.covariance[np.ix_(own, own)] + 1e-12 * np.diag(np.square(away) + 1e-300)
@@ -630,7 +650,6 @@ class Search:
 
     def _linearise_with(self, origin: FittedSet, unlisted: frozenset[int], whole: FloatArray) -> None:
         z, gram = self._linear(whole, origin.likeliest.scales.mode(unlisted))
-        weight = origin.by_groups[unlisted]
         signatures = self._signatures
         single: dict[int, tuple[float, FloatArray]] = {}
         owners: dict[str, list[int]] = {}
@@ -639,7 +658,10 @@ class Search:
                 single[i] = integrate_set(z, gram, [s])
                 owners.setdefault(s.owner, []).append(i)
         ratio = self._averaged_over_scales(origin.likeliest.scales, unlisted, whole, single)
-        gains = {o: log_sum_exp([ratio[i] for i in own]) - float(np.log(len(own))) for o, own in owners.items()}
+        gains = {
+            o: log_sum_exp([ratio[i] + signatures[i].log_share for i in own]) - float(np.log(len(own)))
+            for o, own in owners.items()
+        }
         if not unlisted:
             for o, own in owners.items():
                 taken = {
@@ -656,34 +678,34 @@ class Search:
         # of all alternatives and scales over the best at the likeliest scales
         shared = {o: gains[o] - single[best[o]][0] for o in owners}
         for o, gain in gains.items():
-            self._estimate(origin, weight, {o}, gain, (best[o],), (single[best[o]][1],))
-        pairs = self._pairs(origin, weight, z, gram, single, owners, shared)
-        self._triples(origin, weight, z, gram, pairs, best, gains, shared)
+            self._estimate(origin, unlisted, {o}, gain, (best[o],), (single[best[o]][1],))
+        pairs = self._pairs(origin, unlisted, z, gram, single, owners, shared)
+        self._triples(origin, unlisted, z, gram, pairs, best, gains, shared)
 
     def _estimate(
-        self, origin: FittedSet, weight: float, more: set[str], gain: float, which: tuple[int, ...],
+        self, origin: FittedSet, unlisted: frozenset[int], more: set[str], gain: float, which: tuple[int, ...],
         c: tuple[FloatArray, ...],
     ) -> None:  # fmt: skip
-        """Note a set's log posterior with `weight` the log p(y | A, u) p(u) of its origin. The estimate about the
-        largest origin counts, of several the likeliest; those of one origin by other groups are summed."""
-        key = origin.members | more
+        """Note a set's log posterior beside an origin with these groups unlisted. The estimate about the largest origin
+        counts, of several the likeliest; those of one origin by other groups stand beside each other."""
+        key, weight = origin.members | more, origin.by_groups[unlisted]
         value, at = weight + gain + self.prior.log(key), weight + self.prior.log(origin.members)
         known = self.estimates.get(key)
         if not np.isfinite(value):
             return
+        one = _Estimate({unlisted: value}, gain, at, origin.members, which, c)
         if known is not None and known.origin == origin.members:
-            total = float(np.logaddexp(value, known.log_posterior))
-            first = known if known.log_posterior > value else _Estimate(total, gain, at, origin.members, which, c)
-            self.estimates[key] = replace(first, log_posterior=total)
+            first = known if known.log_posterior > value else one
+            self.estimates[key] = replace(first, by_groups={**known.by_groups, unlisted: value})
         elif known is None or self._is_nearer(origin, known):
-            self.estimates[key] = _Estimate(value, gain, at, origin.members, which, c)
+            self.estimates[key] = one
 
     def _is_nearer(self, origin: FittedSet, known: _Estimate) -> bool:
         other = self.fits[known.origin]
         return (len(origin.members), self._log_posterior(origin)) > (len(other.members), self._log_posterior(other))
 
     def _pairs(
-        self, origin: FittedSet, weight: float, z: FloatArray, gram: FloatArray,
+        self, origin: FittedSet, unlisted: frozenset[int], z: FloatArray, gram: FloatArray,
         single: Mapping[int, tuple[float, FloatArray]], owners: Mapping[str, list[int]], shared: Mapping[str, float],
     ) -> list[tuple[float, str, str, int, int]]:  # fmt: skip
         """Estimate all pairs, the best of them one by one; return these, likeliest first."""
@@ -725,11 +747,11 @@ class Search:
                 cut = len(signatures[one].coordinates)
                 c = (both[:cut], both[cut:])
                 exact.append((value, name, other, one, two_))
-            self._estimate(origin, weight, {name, other}, value, (one, two_), c)
+            self._estimate(origin, unlisted, {name, other}, value, (one, two_), c)
         return sorted(exact, key=lambda t: -(t[0] + prior[t[1]] + prior[t[2]]))
 
     def _triples(
-        self, origin: FittedSet, weight: float, z: FloatArray, gram: FloatArray,
+        self, origin: FittedSet, unlisted: frozenset[int], z: FloatArray, gram: FloatArray,
         pairs: Sequence[tuple[float, str, str, int, int]], best: Mapping[str, int],
         gains: Mapping[str, float], shared: Mapping[str, float],
     ) -> None:  # fmt: skip
@@ -746,7 +768,7 @@ class Search:
                 cuts = np.cumsum([len(s.coordinates) for s in three])[:-1]
                 value += sum(shared[o] for o in (name, other, third))
                 self._estimate(
-                    origin, weight, {name, other, third}, value, (one, two, best[third]), tuple(np.split(c, cuts))
+                    origin, unlisted, {name, other, third}, value, (one, two, best[third]), tuple(np.split(c, cuts))
                 )  # fmt: skip
 
     def _left(self, z: FloatArray, gram: FloatArray, members: Sequence[Signature]) -> FloatArray:
@@ -796,7 +818,7 @@ class Search:
             else:
                 log[key, frozenset()] = self._log_posterior(fit)
         open_ = {k: e for k, e in self.estimates.items() if k not in self.fits and self._is_near(e)}
-        log |= {(k, frozenset()): e.log_posterior for k, e in open_.items()}
+        log |= {(k, u): value for k, e in open_.items() for u, value in e.by_groups.items()}
         tails = {
             k: self._tail(self.fits[k]) for k in self.singles if self._log_posterior(self.fits[k]) > top - FAR_BELOW
         }
@@ -831,7 +853,11 @@ class Search:
             families.setdefault(self.hypotheses[name].family, []).append(name)
         effects = {n: 1.0 - mass((n,)) / whole for n in gains}
         held = {f: 1.0 - mass(names) / whole for f, names in families.items()}
-        return Tail(origin.members, origin.quick + float(np.log(whole)), effects, held)
+        unlisted: dict[str, float] = {}
+        for groups, value in origin.by_groups.items():
+            for name in {self.model.groups[g].name for g in groups}:
+                unlisted[name] = unlisted.get(name, 0.0) + float(np.exp(value - origin.total))
+        return Tail(origin.members, origin.quick + float(np.log(whole)), effects, held, unlisted)
 
 
 def _updated(
@@ -861,8 +887,10 @@ def _differ(one: FittedSet, other: FittedSet) -> bool:
 
 
 def _choices(point: Point) -> object:
+    """Return what tells a point from others of its hypothesis beside u: an effect's choices; else the template."""
     template = point.template
-    return None if template is None else tuple(getattr(template, n) for n in type(template).choices())
+    names = getattr(type(template), "choices", None)
+    return template if names is None else tuple(getattr(template, n) for n in names())
 
 
 def _normal_prior(coords: Sequence[Coordinate], u: FloatArray) -> tuple[FloatArray, FloatArray]:

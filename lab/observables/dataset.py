@@ -88,7 +88,8 @@ class Dataset:
         self._made: dict[Any, Any] = {}
         self._spectra: dict[str, Spectrum] = {}
         times = [c.time for c in recordings.captures(side=side) if c.time is not None]
-        self._start = min(times) if times else None
+        #: Time of the side's first capture; None where none is stated.
+        self.first_time = min(times) if times else None
         warm = [c.temperature_c for c in recordings.captures(side=side) if c.temperature_c is not None]
         #: Median temperature of the sensor; None where none is stated.
         self.temperature_c = float(np.median(warm)) if warm else None
@@ -115,7 +116,9 @@ class Dataset:
 
     def elapsed_s(self, capture: Capture) -> float:
         """Time since the side's first capture, s; 0 where no time is stated."""
-        return 0.0 if capture.time is None or self._start is None else (capture.time - self._start).total_seconds()
+        if capture.time is None or self.first_time is None:
+            return 0.0
+        return (capture.time - self.first_time).total_seconds()
 
     def spectrum(self, path: str) -> Spectrum:
         """Return a spectrum of the recording set, read once."""

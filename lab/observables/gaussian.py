@@ -125,8 +125,8 @@ class Gaussian:
 
 
 def chi2(residual: FloatArray, covariance: FloatArray) -> float:
-    """r' C^-1 r of a dense covariance."""
-    white = solve_triangular(cholesky(covariance, lower=True), residual, lower=True)
+    """r' C^-1 r of a dense covariance, which estimates or rounding may leave indefinite (`BlockCovariance.lower`)."""
+    white = solve_triangular(BlockCovariance(covariance).lower, residual, lower=True)
     return float(white @ white)
 
 
@@ -134,6 +134,6 @@ def conditional(
     residual: FloatArray, covariance: FloatArray, of: np.ndarray, given: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
     """Residual and covariance of the numbers `of`, given those that `given` marks; both are masks (n,)."""
-    inside = cholesky(covariance[np.ix_(given, given)], lower=True), True
+    inside = BlockCovariance(covariance[np.ix_(given, given)]).lower, True
     gain = cho_solve(inside, covariance[np.ix_(given, of)])
     return residual[of] - gain.T @ residual[given], covariance[np.ix_(of, of)] - gain.T @ covariance[np.ix_(given, of)]

@@ -8,6 +8,8 @@ from sim.effects.library import list_changes
 
 #: What frames before leave in a frame: image lag, and charge that traps release.
 LAG = frozenset({"charge.lag", "charge.traps"})
+#: Charge that packets leave behind on their way to the output.
+TRAILS = frozenset({"charge.trails"})
 DARK_CURRENT = frozenset({"charge.dark_current"})
 #: Light that pixels of a colour collect unlike others.
 COLLECTED = frozenset({"charge.collected"})

@@ -92,14 +92,14 @@ class TracedPrescription:
 
 def parse_glasses(replacements: list[str]) -> dict[str, GlassName]:
     """Replacement glasses by name, from NAME=OTHER or NAME=nd,Vd. Raises InputError for anything else."""
-    found: dict[str, GlassName] = {}
+    glasses: dict[str, GlassName] = {}
     for text in replacements:
         name, equals, meaning = (part.strip() for part in text.partition("="))
         if not (name and equals and meaning):
             raise InputError(f"--glass {text}: give NAME=OTHER or NAME=nd,Vd, as in L-TIM28_MOLD=L-TIM28")
         first, comma, second = meaning.partition(",")
         if not comma:
-            found[name.upper()] = GlassName(name=meaning.upper())
+            glasses[name.upper()] = GlassName(name=meaning.upper())
             continue
         try:
             index, abbe = float(first), float(second)
@@ -107,8 +107,8 @@ def parse_glasses(replacements: list[str]) -> dict[str, GlassName]:
             raise InputError(f"--glass {text}: nd and Vd aren't numbers; give them as in 1.5168,64.2") from None
         if not (1.0 < index < 5.0 and 0.0 < abbe < math.inf):
             raise InputError(f"--glass {text}: nd has to lie above 1 and Vd above 0; correct them")
-        found[name.upper()] = GlassName(name=f"nd {index:g} Vd {abbe:g}", model=True, index_d=index, abbe_d=abbe)
-    return found
+        glasses[name.upper()] = GlassName(name=f"nd {index:g} Vd {abbe:g}", model=True, index_d=index, abbe_d=abbe)
+    return glasses
 
 
 def with_glasses(prescription: Prescription, glasses: Mapping[str, GlassName]) -> Prescription:
@@ -154,8 +154,12 @@ def trace_prescription(
         settings = TableSettings(focus=focus, maximum_field_deg=maximum_field_deg, line=True)
         low, high = settings.wavelength_nm[0], settings.wavelength_nm[-1]
         if not low <= system.reference_nm <= high:
-            own = sorted({*prescription.wavelength_nm, system.reference_nm})
-            spread = np.linspace(own[0], own[-1], 33) if len(own) > 1 else np.array(own)
+            wavelengths_nm = sorted({*prescription.wavelength_nm, system.reference_nm})
+            spread = (
+                np.linspace(wavelengths_nm[0], wavelengths_nm[-1], 33)
+                if len(wavelengths_nm) > 1
+                else np.array(wavelengths_nm)
+            )
             settings = settings.model_copy(update={"wavelength_nm": tuple(float(w) for w in spread)})
         work = OpticalTable(system, settings)
         workers = workers or Workers()
@@ -197,8 +201,8 @@ def _fields(
     wavelengths = sorted({system.reference_nm, *(w for w in MTF_WAVELENGTHS_NM if low <= w <= high)})
     tangents = [math.tan(math.radians(float(angle))) for angle in table.field_deg[:, 1]]
     curves: dict[int, tuple[LensMtf, ...]] = {}
-    for f, found in workers.done(_mtf_curves, tangents, system, wavelengths):
-        curves[f] = found
+    for f, at_field in workers.done(_mtf_curves, tangents, system, wavelengths):
+        curves[f] = at_field
         if progress is not None:
             progress(
                 f"MTF of field {len(curves)} of {len(tangents)}",

@@ -74,8 +74,8 @@ class Replay:
         return self.recordings.with_frames(frames)
 
     def _scene_key(self, capture: Capture, effects: Sequence[Effect]) -> object:
-        told = capture.model_dump(exclude={"id", "frame", "time"})
-        return repr(told) if is_steady(self.camera, effects) else capture.id
+        statements = capture.model_dump(exclude={"id", "frame", "time"})
+        return repr(statements) if is_steady(self.camera, effects) else capture.id
 
     def _electrons(self, capture: Capture, effects: Sequence[Effect]) -> tuple[Exposure, FloatArray]:
         edge = self._edge(capture) if isinstance(capture, SlantedEdgeCapture) else None
@@ -86,14 +86,14 @@ class Replay:
         )  # fmt: skip
         electrons = expected_electrons(self.camera, exposure, effects)
         if isinstance(capture, SlantedEdgeCapture):
-            electrons = self._levelled(capture, exposure, electrons, effects)
+            electrons = self._level(capture, exposure, electrons, effects)
         return exposure, electrons
 
     def _scene(self, capture: Capture, edge: EdgeSummary | None) -> Scene:
         if isinstance(capture, SlantedEdgeCapture) and edge is not None:
             light = self.recordings.spectrum(capture.light_radiance) if capture.light_radiance else _EQUAL
             dark = Spectrum.of(*(light.arrays[0], 0.0 * light.arrays[1]))
-            return KnifeEdge((_placed(self._region(capture), edge),), dark, light)
+            return KnifeEdge((_place_edge(self._region(capture), edge),), dark, light)
         scene = capture.scene(self.recordings.spectrum)
         if scene is None:
             raise NotDetermined("replay", f"{capture.id} ({capture.kind}) doesn't tell what stood before the camera")
@@ -107,7 +107,7 @@ class Replay:
     def _region(self, capture: SlantedEdgeCapture) -> tuple[int, int, int, int]:
         return capture.region or (0, 0, self.camera.rows, self.camera.cols)
 
-    def _levelled(
+    def _level(
         self, capture: SlantedEdgeCapture, exposure: Exposure, electrons: FloatArray, effects: Sequence[Effect]
     ) -> FloatArray:
         """Electrons with an edge's two levels matched to the recording, channel by channel, by a least squares line
@@ -124,13 +124,13 @@ class Replay:
             plane = np.zeros(electrons.shape, bool)
             for row, col in phases:
                 plane[row::step, col::step] = True
-            lit, seen = (electrons - dark)[plane & inside], (recorded - dark)[plane & inside]
-            slope, level = np.polyfit(lit, seen, 1)
+            lit, measured = (electrons - dark)[plane & inside], (recorded - dark)[plane & inside]
+            slope, level = np.polyfit(lit, measured, 1)
             out[plane] = np.maximum(slope * (electrons - dark)[plane] + level, 0.0) + dark[plane]
         return out
 
 
-def _placed(region: tuple[int, int, int, int], edge: EdgeSummary) -> EdgeRegion:
+def _place_edge(region: tuple[int, int, int, int], edge: EdgeSummary) -> EdgeRegion:
     """Return a straight edge at the centre and the angle that the estimator found."""
     row, col = edge.curve.centre
     if edge.curve.transposed:

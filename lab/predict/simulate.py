@@ -220,8 +220,8 @@ def _check_field(camera: CameraModel, geometry: Geometry) -> None:
     if geometry.projection == "pinhole":
         return
     row, col = np.array([0.0, 0.0, 1.0, 1.0]) * (camera.rows - 1), np.array([0.0, 1.0, 0.0, 1.0]) * (camera.cols - 1)
-    seen = rays(col, row, geometry)
-    angle_deg = np.rad2deg(np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]))
+    directions = rays(col, row, geometry)
+    angle_deg = np.rad2deg(np.arctan2(np.hypot(directions[:, 0], directions[:, 1]), directions[:, 2]))
     if not np.all(angle_deg <= WIDEST_SCENE_DEG):
         raise InputError(
             f"the corner of the frame sees {np.nanmax(angle_deg):.0f} deg off the axis ({geometry.projection} "
@@ -269,11 +269,11 @@ def _check_light(
     if asked_for or np.any(electrons > dark):
         return
     curves = camera.quantum_efficiency.values()
-    seen = min(c.wavelength_nm[0] for c in curves), max(c.wavelength_nm[-1] for c in curves)
+    sensitive_nm = min(c.wavelength_nm[0] for c in curves), max(c.wavelength_nm[-1] for c in curves)
     raise InputError(
         f"scene {options.scene!r} under {options.illuminant!r} makes no electrons: its light runs from "
-        f"{white.wavelength_nm[0]:g} to {white.wavelength_nm[-1]:g} nm, the sensor sees {seen[0]:g} to {seen[1]:g} "
-        "nm; give a light with power there"
+        f"{white.wavelength_nm[0]:g} to {white.wavelength_nm[-1]:g} nm, the sensor sees {sensitive_nm[0]:g} to "
+        f"{sensitive_nm[1]:g} nm; give a light with power there"
     )
 
 
@@ -291,7 +291,7 @@ def _record(
     mean, variance = sensor.dn_moments(level, camera, exposure.gain_db)
     imaging = camera.lens.imaging
     described = camera.model_dump(mode="json")
-    effects = [{"name": one.name, **one.model_dump(mode="json")} for one in content.effects]
+    effects = [{"name": effect.name, **effect.model_dump(mode="json")} for effect in content.effects]
     return SimulationRecord(
         file="",
         frame_sha256=hashlib.sha256(frame.astype("<u2").tobytes()).hexdigest(),
@@ -319,11 +319,11 @@ def _record(
 
 def camera_sha256(content: CameraFile) -> str:
     """SHA-256 of the camera model, which includes a traced lens's hash, and of its effects."""
-    parts = [content.camera.model_dump_json(), *(f"{one.name} {one.model_dump_json()}" for one in content.effects)]
+    parts = [
+        content.camera.model_dump_json(),
+        *(f"{effect.name} {effect.model_dump_json()}" for effect in content.effects),
+    ]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
-
-
-# --- files ------------------------------------------------------------------------------------------------------------
 
 
 def check_out(file: Path) -> None:
@@ -366,9 +366,6 @@ def record_file(file: Path) -> Path:
     return file.with_name(f"{file.stem}.json")
 
 
-# --- preview ----------------------------------------------------------------------------------------------------------
-
-
 def neutral(camera: CameraModel, white: Spectrum) -> dict[str, float] | None:
     """Relative signal of a white surface in the scene's light, by channel; None for a MONO camera, and where a channel
     gets no signal."""
@@ -386,7 +383,7 @@ def preview(frame: Frame, camera: CameraModel, white: Spectrum) -> NDArray[np.ui
     if camera.cfa == "MONO":
         linear = np.repeat(((frame - camera.black_level_dn) / span)[..., None], 3, axis=2)
     else:
-        linear = (_demosaicked(frame, camera) - camera.black_level_dn) / span
+        linear = (_demosaic(frame, camera) - camera.black_level_dn) / span
         balance = neutral(camera, white)
         if balance is not None:
             top = max(balance.values())
@@ -397,7 +394,7 @@ def preview(frame: Frame, camera: CameraModel, white: Spectrum) -> NDArray[np.ui
     return np.asarray(np.rint(255.0 * shown), np.uint8)
 
 
-def _demosaicked(frame: Frame, camera: CameraModel) -> FloatArray:
+def _demosaic(frame: Frame, camera: CameraModel) -> FloatArray:
     if min(frame.shape) < 4:
         return np.repeat(frame[..., None].astype(float), 3, axis=2)
     # OpenCV names a mosaic by the second row's second and third pixel.
@@ -438,16 +435,16 @@ def options_of(values: Mapping[str, Any]) -> SimulateOptions:
 
 def parameters_of(given: Sequence[str]) -> dict[str, float]:
     """Return the scene's parameters from KEY=VALUE pairs. Raises InputError for anything else."""
-    found = {}
+    read = {}
     for pair in given:
         key, equals, value = pair.partition("=")
         try:
-            found[key.strip()] = float(value)
+            read[key.strip()] = float(value)
         except ValueError:
             equals = ""
         if not equals:
             raise InputError(f"--set {pair}: isn't KEY=VALUE with a number; write it as in --set contrast=0.4")
-    return found
+    return read
 
 
 def summary_lines(record: SimulationRecord, file: Path) -> list[str]:

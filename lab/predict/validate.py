@@ -113,9 +113,6 @@ def _check(
     )
 
 
-# --- the chart --------------------------------------------------------------------------------------------------------
-
-
 def _charts(
     recordings: RecordingSet,
     side: Side,
@@ -200,9 +197,6 @@ def _curve_std(model: CameraModel, channel: str, wavelength_nm: FloatArray) -> f
     return float(np.sqrt(np.sum(np.square(std.at(grid)))) / total) if total > 0 else 1.0
 
 
-# --- edges ------------------------------------------------------------------------------------------------------------
-
-
 def _edges(
     recordings: RecordingSet,
     side: Side,
@@ -218,9 +212,9 @@ def _edges(
     if not captures:
         raise NotDetermined("mtf", "no slanted-edge captures")
     settings: dict[object, list[SlantedEdgeCapture]] = {}
-    for found in captures:
-        key = (found.region, found.angle_deg, found.exposure_s, found.gain_db, found.light_radiance)
-        settings.setdefault(key, []).append(found)
+    for edge in captures:
+        key = (edge.region, edge.angle_deg, edge.exposure_s, edge.gain_db, edge.light_radiance)
+        settings.setdefault(key, []).append(edge)
     checks, reason = [], ""
     for repeats in settings.values():
         capture = repeats[0]
@@ -232,7 +226,7 @@ def _edges(
             except NotDetermined as refused:
                 reason = refused.reason
                 continue
-            predicted = _predicted_mtf(recordings, capture, channel, measured, model, effects)
+            predicted = _predict_mtf(recordings, capture, channel, measured, model, effects)
             residuals.append(measured.mtf - predicted)
             blocks.append(measured.covariance + np.diag(np.full(len(predicted), MTF_FLOOR**2)))
             reference.append(np.maximum(predicted, 0.1))
@@ -255,7 +249,7 @@ def _edges(
     return checks
 
 
-def _predicted_mtf(
+def _predict_mtf(
     recordings: RecordingSet,
     capture: SlantedEdgeCapture,
     channel: str,
@@ -279,9 +273,6 @@ def _diagonal(blocks: Sequence[NDArray[Any]]) -> FloatArray:
     return out
 
 
-# --- kernels ----------------------------------------------------------------------------------------------------------
-
-
 def _kernels(
     recordings: RecordingSet,
     side: Side,
@@ -295,17 +286,17 @@ def _kernels(
     screens = {c.id: c.screen for c in recordings.captures(BernoulliCapture, side)}
     by_capture: dict[str, list[KernelPair]] = {}
     numbers: dict[str, list[tuple[FloatArray, FloatArray, FloatArray]]] = {}
-    for found in fit.psf:
-        if found.sample_pitch_px != 1.0:
+    for psf in fit.psf:
+        if psf.sample_pitch_px != 1.0:
             continue
-        tell(found.capture)
-        screen = screens.get(found.capture)
+        tell(psf.capture)
+        screen = screens.get(psf.capture)
         light = recordings.spectrum(screen.radiance) if screen and screen.radiance else None
         cell_px = screen.cell_camera_px if screen else None
-        measured, std = np.array(found.psf), np.array(found.psf_std)
+        measured, std = np.array(psf.psf), np.array(psf.psf_std)
         predicted: FloatArray = np.asarray(
             expected_kernel(
-                lambda fx, fy, channel=found.channel, light=light: optical_transfer(  # type: ignore[misc]
+                lambda fx, fy, channel=psf.channel, light=light: optical_transfer(  # type: ignore[misc]
                     model, channel, light, fx, fy, effects, "bernoulli"
                 ),
                 len(measured),
@@ -315,13 +306,13 @@ def _kernels(
         )
         error = float(np.mean(np.square(measured - predicted)))
         peak = float(predicted.max())
-        by_capture.setdefault(found.capture, []).append(
+        by_capture.setdefault(psf.capture, []).append(
             KernelPair(
-                label=found.capture, channel=found.channel, predicted=_rows(predicted), measured=_rows(measured),
+                label=psf.capture, channel=psf.channel, predicted=_rows(predicted), measured=_rows(measured),
                 psnr_peak_db=_psnr(peak, error), psnr_unit_db=_psnr(1.0, error),
             )
         )  # fmt: skip
-        numbers.setdefault(found.capture, []).append(
+        numbers.setdefault(psf.capture, []).append(
             (
                 (measured - predicted).ravel(),
                 std.ravel() ** 2 + (KERNEL_FLOOR * peak) ** 2,
@@ -409,15 +400,15 @@ def predict_both(
     for side, camera in improved.items():
         maker = camera_model(recordings, side, fit.cameras.get(side), maker_curves=True).quantum_efficiency
         baseline[side] = baseline_of(camera, (always or {}).get(side), maker if side in discrepant else None)
-    is_other = discrepant or any(improved[side].effects != one.effects for side, one in baseline.items())
+    is_other = discrepant or any(improved[side].effects != camera.effects for side, camera in baseline.items())
 
     def checks(models: Mapping[Side, CameraFile], name: str, begun: float) -> tuple[Check, ...]:
         def tell(what: str, share: float) -> None:
             if progress is not None:
                 progress(f"{name}: {what}", begun + 0.5 * share)
 
-        found = validate(recordings, fit, models, tell).checks
-        return tuple(check for check in found if check.side in models)
+        checks = validate(recordings, fit, models, tell).checks
+        return tuple(check for check in checks if check.side in models)
 
     return BothModels(
         baseline=checks(baseline, "baseline", 0.0),
@@ -450,8 +441,12 @@ def _apparent(file: CameraFile, channel: str, wavelength_nm: float) -> float:
     line = Spectrum.of(
         np.array([wavelength_nm - LINE_NM, wavelength_nm, wavelength_nm + LINE_NM]), np.array([0.0, 1.0, 0.0])
     )
-    own = float(file.camera.quantum_efficiency[channel].at(wavelength_nm))
+    efficiency = float(file.camera.quantum_efficiency[channel].at(wavelength_nm))
     if not file.effects:
-        return own
+        return efficiency
     plain = electron_rate(file.camera, channel, line)
-    return own * electron_rate(file.camera, channel, line, file.effects, "narrowband") / plain if plain > 0.0 else own
+    return (
+        efficiency * electron_rate(file.camera, channel, line, file.effects, "narrowband") / plain
+        if plain > 0.0
+        else efficiency
+    )

@@ -21,9 +21,6 @@ from sim.camera import Side
 from sim.parameters import Frozen
 from sim.sensor.mosaic import first_pixels, planes
 
-# --- A frame at a glance: histogram, mean and share of saturated pixels of each channel of the mosaic -----------------
-
-
 BINS = 64
 
 
@@ -52,12 +49,12 @@ def frame_figures(frame: NDArray[np.uint16], camera: DataSheet) -> FrameFigures:
     """Return the figures of `frame` (rows, cols), from one count of the codes of each channel."""
     top = camera.saturation_dn
     bin_dn = (top + 1.0) / BINS
-    found = []
+    curves = []
     firsts = first_pixels(camera.cfa)
     for name, plane in planes(frame, camera.cfa).items():
         codes = np.bincount(plane.ravel(), minlength=int(top) + 1)
         at = np.minimum((np.arange(codes.size) / bin_dn).astype(int), BINS - 1)
-        found.append(
+        curves.append(
             ChannelFigures(
                 channel=name,
                 row=firsts[name][0],
@@ -67,7 +64,7 @@ def frame_figures(frame: NDArray[np.uint16], camera: DataSheet) -> FrameFigures:
                 counts=tuple(np.bincount(at, codes, BINS).astype(int).tolist()),
             )
         )
-    return FrameFigures(bin_dn=bin_dn, black_level_dn=camera.black_level_dn, saturation_dn=top, channels=tuple(found))
+    return FrameFigures(bin_dn=bin_dn, black_level_dn=camera.black_level_dn, saturation_dn=top, channels=tuple(curves))
 
 
 #: Captures that one look takes at most: a session that is long under way is looked at in several.
@@ -216,13 +213,13 @@ class GrowingCurves:
         if not self._first(capture, name):
             return
         channel = "Y" if recordings.camera(capture.side).cfa == "MONO" else "G"
-        found = read_mtf(measure_edge(recordings, [capture], channel), FREQUENCIES_CY_PER_PX)
+        mtf = read_mtf(measure_edge(recordings, [capture], channel), FREQUENCIES_CY_PER_PX)
         self._edges.append(
             EdgeLook(
                 side=capture.side,
                 region=name,
                 frequency_cy_per_px=tuple(FREQUENCIES_CY_PER_PX.tolist()),
-                mtf=tuple(np.round(found.mtf, 5).tolist()),
+                mtf=tuple(np.round(mtf.mtf, 5).tolist()),
             )
         )
 

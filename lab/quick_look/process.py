@@ -72,14 +72,14 @@ class QuickLook:
 
     def _ask(self, session_id: str) -> None:
         try:
-            found = self._asked(session_id)
+            answer = self._asked(session_id)
         except Exception as error:
             log.warning("curves of session %s: %s", session_id, error)
-            found = None
+            answer = None
         with self._lock:
             self._asked_for.discard(session_id)
-            if found is not None:
-                self._known[session_id] = _Known(time.monotonic(), found)
+            if answer is not None:
+                self._known[session_id] = _Known(time.monotonic(), answer)
                 self._known.move_to_end(session_id)
                 while len(self._known) > SESSIONS:
                     self._known.popitem(last=False)
@@ -101,10 +101,10 @@ class QuickLook:
                 self._process = self._started()
             line = self._answer(self._process, session_id)
             if line:
-                found = json.loads(line)
-                if "error" in found:
-                    raise InputError(found["error"])
-                return Curves.model_validate(found)
+                answer = json.loads(line)
+                if "error" in answer:
+                    raise InputError(answer["error"])
+                return Curves.model_validate(answer)
             self._end()
             if self._closed:
                 break
@@ -135,9 +135,6 @@ class QuickLook:
             if select.select([process.stdout], [], [], PATIENCE_S)[0]:
                 return process.stdout.readline()
         return ""
-
-
-# --- the process ------------------------------------------------------------------------------------------------------
 
 
 def serve() -> None:

@@ -37,7 +37,7 @@ from lab.report import diagnosis as diagnosis_page
 from lab.report.charts import ChartData, plotly_base64
 from lab.report.emva import data_sheets
 from lab.report.figures import by_side, geometry_figures, stereo_figures
-from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
+from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trim_margin
 from lab.report.stills import still
 from sim.camera import Side
 
@@ -72,7 +72,7 @@ class _Kernel:
         first = next(iter(pairs.values()))
         seen = np.asarray(first.measured, float)
         predicted = {model: np.asarray(pair.predicted, float) for model, pair in pairs.items()}
-        margin = trimmed_margin([seen, *predicted.values()])
+        margin = trim_margin([seen, *predicted.values()])
         peak = max(float(one.max()) for one in predicted.values())
         # at least 5 % of the peak, so that noise doesn't look like a difference
         limit = max(*(float(np.abs(seen - one).max()) for one in predicted.values()), 0.05 * peak)
@@ -234,7 +234,7 @@ def render_report(
         },
         "mtf_explained": {
             side: charts.transfer_overlays(
-                charts.explained_overlays([curve for curve in curves if curve.side == side]), 2
+                charts.overlay_explained([curve for curve in curves if curve.side == side]), 2
             )
             for side in sides
         }
@@ -242,7 +242,7 @@ def render_report(
         else {},
         "mtf": {
             side: charts.transfer_overlays(
-                charts.validated_overlays([(one, after(one)) for one in _without_repeats(recordings, of(side, "mtf"))]),
+                charts.overlay_validated([(one, after(one)) for one in _without_repeats(recordings, of(side, "mtf"))]),
                 model=model,
             )
             for side in sides

@@ -50,7 +50,7 @@ FADED = 0.22  # opacity of an uncertainty band
 FEW_DECADES, LOG_MARGIN = 2.5, 0.04
 
 
-def _faded(colour: str, opacity: float = FADED) -> str:
+def _fade(colour: str, opacity: float = FADED) -> str:
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
     return f"rgba({red},{green},{blue},{opacity})"
 
@@ -116,7 +116,7 @@ def band(
         "x": [*x, *reversed(list(x))],
         "y": [*(centre + half).tolist(), *reversed((centre - half).tolist())],
         "fill": "toself",
-        "fillcolor": _faded(colour),
+        "fillcolor": _fade(colour),
         "line": {"width": 0},
         "hoverinfo": "skip",
         "showlegend": False,
@@ -259,9 +259,9 @@ def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[
         half = 0.5 * float(np.median(np.diff(spectral.wavelength_nm)))
         bottom = 0.95 - 0.055 * channels.index(one.channel)
         at = {"x0": one.from_nm - half, "x1": one.to_nm + half}
-        look = {"type": "rect", "fillcolor": _faded(colour), "line": {"width": 0}, "layer": "below"}
+        look = {"type": "rect", "fillcolor": _fade(colour), "line": {"width": 0}, "layer": "below"}
         shapes.append(look | at | {"yref": "paper", "y0": bottom, "y1": bottom + 0.05})
-        shapes.append(look | at | {"yref": "paper", "y0": 0.0, "y1": bottom, "fillcolor": _faded(colour, 0.07)})
+        shapes.append(look | at | {"yref": "paper", "y0": 0.0, "y1": bottom, "fillcolor": _fade(colour, 0.07)})
         size = "new" if one.difference_percent is None else f"{one.difference_percent:+.1f} %"
         if one.to_nm - one.from_nm + 2 * half < LABELLED_SHARE * (
             spectral.wavelength_nm[-1] - spectral.wavelength_nm[0]
@@ -388,7 +388,7 @@ class Overlay:
     explained: Sequence[float] | None = None
 
 
-def validated_overlays(checks: Sequence[tuple[Check, Check | None]]) -> dict[str, list[Overlay]]:
+def overlay_validated(checks: Sequence[tuple[Check, Check | None]]) -> dict[str, list[Overlay]]:
     """Return panel title -> curves, one panel for each check by a first model and, where there is one, by the improved
     model."""
     panels: dict[str, list[Overlay]] = {}
@@ -408,7 +408,7 @@ def validated_overlays(checks: Sequence[tuple[Check, Check | None]]) -> dict[str
     return panels
 
 
-def explained_overlays(curves: Sequence[ResidualCurve], measurement: str = "slanted_edge") -> dict[str, list[Overlay]]:
+def overlay_explained(curves: Sequence[ResidualCurve], measurement: str = "slanted_edge") -> dict[str, list[Overlay]]:
     """Panel title -> curves of one measurement from the diagnosis; where a curve exists twice, the held-out one."""
     chosen: dict[tuple[str, str], ResidualCurve] = {}
     for curve in curves:
@@ -506,7 +506,7 @@ def mtf_curves(curves: Sequence[MtfCurve]) -> Figure:
     }
 
 
-def predicted_curves(curves: Sequence[CurveComparison]) -> Figure:
+def draw_predicted_curves(curves: Sequence[CurveComparison]) -> Figure:
     """Return measured curves (points with one standard deviation) and their predictions (lines) on one axis."""
     data: list[Trace] = []
     for curve in curves:
@@ -524,7 +524,7 @@ def predicted_curves(curves: Sequence[CurveComparison]) -> Figure:
     return {"data": data, "layout": layout(300, xaxis=axis(curves[0].axis), yaxis=axis("MTF", rangemode="tozero"))}
 
 
-def predicted_patches(patches: Sequence[PatchComparison]) -> Figure:
+def draw_predicted_patches(patches: Sequence[PatchComparison]) -> Figure:
     """Return predicted against measured signals of a chart's patches, DN above black, by channel; bars: one standard
     deviation of both together."""
     data: list[Trace] = []
@@ -687,7 +687,7 @@ def beyond_axis(name: str, residual: np.ndarray[Any, Any]) -> str:
     )
 
 
-def _named_ticks(curve: ResidualCurve) -> dict[str, Any]:
+def _name_ticks(curve: ResidualCurve) -> dict[str, Any]:
     """Tick labels with the points' names, where x only numbers them."""
     if not curve.names:
         return {}
@@ -745,7 +745,7 @@ def residual_curve(curve: ResidualCurve) -> Figure:
         "data": data,
         "layout": layout(
             330,
-            xaxis=axis(curve.axis, anchor="y2", **_named_ticks(curve)),
+            xaxis=axis(curve.axis, anchor="y2", **_name_ticks(curve)),
             yaxis=axis(
                 "<br>".join(textwrap.wrap(curve.quantity or "measured", 20)), domain=[0.44, 1.0], range=_range(curve)
             ),
@@ -852,7 +852,7 @@ class ChartData:
         return base64.b64encode(gzip.compress("\n".join(self._lines).encode(), mtime=0)).decode("ascii")
 
 
-def _packed(values: Any) -> dict[str, str] | None:
+def _pack(values: Any) -> dict[str, str] | None:
     """Numbers as plotly's typed array (float32, base64; NaN where there is none), None where it isn't an array worth
     packing."""
     if not isinstance(values, list | tuple) or len(values) < PACKED_FROM:
@@ -872,7 +872,7 @@ def figure_json(figure: Figure) -> str:
     """Return a figure as one line of JSON: a trace's numbers as typed arrays, others rounded to 7 digits."""
 
     def rounded(value: Any, key: str = "") -> Any:
-        if key in PACKED and (packed := _packed(value)) is not None:
+        if key in PACKED and (packed := _pack(value)) is not None:
             return packed
         if isinstance(value, dict):
             return {name: rounded(item, name) for name, item in value.items()}

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from lab.diagnose.discovery.words import departure_unit
 from lab.diagnose.outcome.detectability import detectable, told_as
+from lab.diagnose.outcome.law_words import departure_unit
 from lab.formats.results import (
     DiagnosisResult,
     DiscoveredLaw,
@@ -20,7 +20,7 @@ from lab.formats.results import (
     Visibility,
 )
 from lab.formats.results.words import plain_number, shown_unit
-from lab.observables.observable import measurement_title
+from lab.observables.observable import measurement_title, measurements
 from lab.report.charts import AFTER, CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.pictures import difference_picture
 from sim.camera import Side
@@ -65,10 +65,12 @@ def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[st
 def _law_chart(law: DiscoveredLaw) -> Figure:
     """Draw the shortest table of a discovered law: a periodic one with two standard deviations of each entry; one by
     code with the median of these as a band about no change; a curve over its coordinate; a table by row and column as a
-    map.
+    map; a curve of one measurement by channel and condition.
     """
     if law.columns:
         return _cell_map(law)
+    if law.curve_of:
+        return _of_measurement(law)
     if law.along == "plane x time":
         return _by_channel(law)
     unit = departure_unit(law.stage, law.along, law.of, bool(law.at))
@@ -96,9 +98,9 @@ def _law_chart(law: DiscoveredLaw) -> Figure:
         data.append(band(ends, none, np.full(2, float(np.median(half))), AFTER))
         points["marker"] = {"color": "@fg", "size": 2}
     else:
-        place = EMPIRICAL_PLACES[law.stage, law.along, law.of]  # type: ignore[index]
+        place = EMPIRICAL_PLACES.get((law.stage, law.along, law.of))  # type: ignore[arg-type]
         if len(law.at) == len(departure):
-            x, along = np.array(law.at), f"{law.along}, {place[2]}"
+            x, along = np.array(law.at), f"{law.along}, {place[2] if place else 'cycles per um'}"
         data.append(band(x.tolist(), departure, half, AFTER))
         points |= {"mode": "lines", "line": {"color": "@fg", "width": 2}}
     points |= {"x": x.tolist(), "y": departure.tolist()}
@@ -119,6 +121,25 @@ def _by_channel(law: DiscoveredLaw) -> Figure:
             "line": {"color": CHANNEL[name], "width": 2},
         })  # fmt: skip
     return {"data": data, "layout": layout(220, xaxis=axis("time, s"), yaxis=axis("factor less 1, %"))}
+
+
+def _of_measurement(law: DiscoveredLaw) -> Figure:
+    """Draw a curve of one measurement's numbers over its axis, a line for each channel and condition, with two standard
+    deviations."""
+    measurement = next((m for m in measurements() if m.name == law.curve_of), None)
+    x, departure, half = np.array(law.at), np.array(law.shown_departure), 2.0 * np.array(law.shown_std)
+    data: list[Trace] = []
+    for label in dict.fromkeys(law.labels):
+        own = [k for k, one in enumerate(law.labels) if one == label]
+        colour = CHANNEL.get(label.partition(" ")[0], "#888888")
+        data.append(band(x[own].tolist(), departure[own], half[own], colour))
+        data.append({
+            "type": "scatter", "mode": "lines+markers", "x": x[own].tolist(), "y": departure[own].tolist(),
+            "name": label, "line": {"color": colour, "width": 2},
+        })  # fmt: skip
+    along = law.along if measurement is None else f"{measurement.axis.replace('_', ' ')}, {measurement.unit}"
+    quantity = "departure" if measurement is None else f"departure: {measurement.quantity}"
+    return {"data": data, "layout": layout(220, xaxis=axis(along), yaxis=axis(quantity))}
 
 
 def _cell_map(law: DiscoveredLaw) -> Figure:
@@ -151,9 +172,6 @@ def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) ->
     for curve in sorted(curves, key=lambda curve: (curve.held_out, missed(curve))):
         chosen[curve.measurement] = curve
     return sorted(chosen.values(), key=missed, reverse=True)[:most]
-
-
-# --- heat maps --------------------------------------------------------------------------------------------------------
 
 
 def place_maps(diagnosis: DiagnosisResult, sides: Sequence[Side]) -> list[tuple[str, Figure]]:
@@ -228,9 +246,6 @@ def _short(sigma: float) -> str:
     return f"{sigma:.1f}" if sigma < 9.95 else f"{sigma:.0f}" if sigma < 99.5 else "99+"
 
 
-# --- residual pictures ------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _ResidualImages:
     """One frame's residual images by both models."""
@@ -259,9 +274,6 @@ class _ResidualImages:
         )
 
 
-# --- smallest detectable effects --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Detectable:
     """One effect's cells in the table of detectable effects."""
@@ -284,7 +296,7 @@ def _visibility(items: Sequence[Visibility]) -> dict[str, dict[Side, _Detectable
         }
         units = {name: (unit, quantity) for (name, unit), quantity in told.items()}
         sizes = [_smallest_size(name, value, *units[name]) for name, value in item.smallest.items()]
-        text = ", ".join(sizes) or "not a matter of size"
+        text = ", ".join(sizes) or "detectable at any magnitude"
         table.setdefault(item.effect, {})[item.side] = _Detectable(text, item.nearest, item.cosine, item.told_apart)
     return table
 

@@ -27,8 +27,6 @@ from sim.camera import Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray
 
-# --- Parts of the data sheet's plots: a plot with its caption, markers, lines -----------------------------------------
-
 
 @dataclass(frozen=True)
 class EmvaPlot:
@@ -78,7 +76,6 @@ def floats(values: NDArray[np.floating[Any]]) -> list[float]:
     return [float(value) for value in values]
 
 
-# --- emva spatial ----------------------------------------------------------------------------------------------------
 # The data sheet's spatial plots: spectrograms, histograms and profiles of DSNU and PRNU.
 
 
@@ -154,7 +151,7 @@ def spectrogram(image: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(np.fft.rfftfreq(length)[1:], float), np.asarray(np.sqrt(power[1:]), float)
 
 
-def _smoothed(values: FloatArray, most: int = MOST_POINTS) -> FloatArray:
+def _smooth(values: FloatArray, most: int = MOST_POINTS) -> FloatArray:
     """At most `most` values: the largest of each run, as means would hide lines of a spectrum."""
     if values.size <= most:
         return values
@@ -168,7 +165,7 @@ def _spectrogram(name: str, image: FloatArray, left: float, unit: str) -> EmvaPl
     whole = float(np.sqrt(max(image.var() - left, 0.0)))
     for text, turned, colour in (("rows (horizontal)", image, AFTER), ("columns (vertical)", image.T, BEFORE)):
         frequency, amplitude = spectrogram(turned)
-        amplitude = _smoothed(amplitude)
+        amplitude = _smooth(amplitude)
         data.append(
             curve(text, floats(np.linspace(frequency[0], frequency[-1], amplitude.size)), floats(amplitude), colour)
         )
@@ -279,7 +276,6 @@ def _profiles(name: str, image: FloatArray, unit: str) -> EmvaPlot:
     )
 
 
-# --- emva temporal ---------------------------------------------------------------------------------------------------
 # The data sheet's temporal plots: photon transfer, responsivity, SNR, linearity, dark current; and those of the joint
 # fit.
 
@@ -583,9 +579,6 @@ def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
     )
 
 
-# --- emva ------------------------------------------------------------
-
-
 MAP_WIDTH_PX = 300
 
 #: Field of `Emva1288` -> (quantity, symbol, unit, factor on the value), in the order of the standard's summary sheet.
@@ -679,7 +672,7 @@ def data_sheets(recordings: RecordingSet, fit: FitResult) -> Iterator[EmvaSheet]
                     remark if len(which) == len(names) else f"{', '.join(which)}: {remark}"
                     for remark, which in grouped.items()
                 ),
-                *compared_estimates(noise),
+                *compare_estimates(noise),
             ),
             channels=tuple(noise.channels) if len(noise.channels) > 1 else (),
             channel_rows=tuple(_channel_rows(noise)),
@@ -712,7 +705,7 @@ BOTH_ESTIMATES = {
 APART_SIGMA = 2.0
 
 
-def compared_estimates(noise: NoiseFit) -> Iterator[str]:
+def compare_estimates(noise: NoiseFit) -> Iterator[str]:
     """Yield by how much the standard's figures and the joint fit's differ, in per cent and in combined standard
     deviations (which are too large where both use the same noise), and why they may: the system gain always, the
     others where they are apart."""

@@ -265,7 +265,7 @@ def facts(geometry: GeometryFit) -> list[tuple[str, str]]:
     return rows
 
 
-def rectified_picture(recordings: RecordingSet, stereo: StereoFit, width_px: int = 1200) -> tuple[str, str] | None:
+def draw_rectified(recordings: RecordingSet, stereo: StereoFit, width_px: int = 1200) -> tuple[str, str] | None:
     """Both cameras' images of one pose, rectified, side by side with lines along the rows; and the pose's name."""
     try:
         sides: tuple[Side, Side] = ("left", "right")
@@ -341,7 +341,7 @@ def stereo_context(recordings: RecordingSet, stereo: StereoFit | None) -> dict[s
         return {"depth": [], "rectified": None, "row_rms_px": None, "rejected": (), "remarks": ()}
     return {
         "depth": [(depth, figure) for depth in stereo.depth if (figure := depth_map(depth)) is not None],
-        "rectified": rectified_picture(recordings, stereo),
+        "rectified": draw_rectified(recordings, stereo),
         "row_rms_px": stereo.rectification.row_rms_px if stereo.rectification else None,
         "rejected": stereo.rejected,
         "remarks": stereo.remarks,

@@ -98,9 +98,6 @@ def _skipped(items: Sequence[Skipped]) -> tuple[str, ...]:
     return tuple(f"{one.step}{f' ({one.side})' if one.side else ''}: {one.reason}" for one in items)
 
 
-# --- what each result shows -------------------------------------------------------------------------------------------
-
-
 @singledispatch
 def summary(result: object) -> ShownSummary:
     """Return what is shown of a result."""

@@ -78,7 +78,7 @@ def difference_picture(difference: ArrayLike, limit: float, margin: int = 0) -> 
     return png_data_uri(mixed.round().astype(np.uint8))
 
 
-def trimmed_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> int:
+def trim_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> int:
     """Width of the border, in cells, in which all `kernels` stay below `share` of their highest value; at least 7 cells
     are left."""
     highest = max(float(kernel.max()) for kernel in kernels)
@@ -127,9 +127,6 @@ def frame_picture(frame: NDArray[np.uint16], camera: DataSheet, width_px: int = 
         size = (width_px, max(1, round(display.shape[0] * factor)))
         display = cv2.resize(display, size, interpolation=cv2.INTER_AREA)
     return photograph_data_uri((255 * display).round().astype(np.uint8))
-
-
-# --- Maps of single pixels as files: arrays for the correction of frames, and pictures of them ------------------------
 
 
 #: Field of `PixelMaps` -> (title, unit).

@@ -126,9 +126,6 @@ def _on_white(value: Any) -> Any:
     return ON_WHITE.get(value, value) if isinstance(value, str) else value
 
 
-# --- which charts a result has ----------------------------------------------------------------------------------------
-
-
 @singledispatch
 def charts_of(result: object) -> Iterator[Chart]:
     """Yield the charts of a result, the one that tells most first; none of what has no chart."""
@@ -161,9 +158,9 @@ def _(result: ValidationResult) -> Iterator[Chart]:
         name = f"{check.side} {check.name} {check.capture}"
         title = f"{check.side}: {check.name} of {check.capture}, measured and predicted"
         if check.curves:
-            yield Chart(name, title, charts.predicted_curves(check.curves))
+            yield Chart(name, title, charts.draw_predicted_curves(check.curves))
         elif check.patches:
-            yield Chart(name, title, charts.predicted_patches(check.patches))
+            yield Chart(name, title, charts.draw_predicted_patches(check.patches))
 
 
 @charts_of.register

@@ -62,10 +62,10 @@ class CharacteristicCurve:
     @cached_property
     def _weights(self) -> FloatArray:
         """Weights (n, n) of the means in the slope at each level; 0 at saturated ones, which no slope rests on."""
-        found = np.zeros((self.light.size, self.light.size))
-        own = slice(0, self.unsaturated)
-        found[own, own] = slope_weights(self.light[own])
-        return found
+        covariance = np.zeros((self.light.size, self.light.size))
+        unsaturated = slice(0, self.unsaturated)
+        covariance[unsaturated, unsaturated] = slope_weights(self.light[unsaturated])
+        return covariance
 
     @cached_property
     def slope(self) -> FloatArray:
@@ -262,10 +262,10 @@ class Emva1288General(Standard):
 
     def deviations(self) -> Iterator[Deviation]:
         if self.linear is not None:
-            for one in (*level_deviations(self.linear), *uniformity_deviations(self.linear)):
-                own = tuple(name for name in one.figures if name in self.declarations())
-                if not one.figures or own:
-                    yield one.model_copy(update={"figures": own})
+            for deviation in (*level_deviations(self.linear), *uniformity_deviations(self.linear)):
+                touched = tuple(name for name in deviation.figures if name in self.declarations())
+                if not deviation.figures or touched:
+                    yield deviation.model_copy(update={"figures": touched})
 
     def remarks(self) -> Iterator[str]:
         yield (
@@ -344,35 +344,35 @@ def characteristic_curves(side: MeasuredSide) -> tuple[dict[str, CharacteristicC
     at_s = np.array([level.exposure_s for level in series.darks])
     exposure_s = np.array([dark.exposure_s, *series.exposure_s])
     light_std = np.array([0.0, *series.amount_std])
-    found = {}
+    points_of = {}
     for name, below in dark.plane.items():
         planes = [below, *(stack[name] for stack in series.stacks)]
-        highest = max(one.highest for one in planes)
+        highest = max(plane_level.highest for plane_level in planes)
         line = dark_line(
             at_s,
             np.array([level.plane[name].mean for level in series.darks]),
             np.array([level.plane[name].mean_std for level in series.darks]),
         )
         grown = (line.rate or 0.0) * (exposure_s - dark.exposure_s)
-        signal = np.array([one.mean - below.mean for one in planes])
-        own_std = np.array([repeated_mean_std(one) for one in planes])
+        signal = np.array([plane_level.mean - below.mean for plane_level in planes])
+        mean_std = np.array([repeated_mean_std(plane_level) for plane_level in planes])
         unsaturated = count_unsaturated(
-            np.array([one.mean for one in planes]) - grown,
-            np.array([one.temporal_variance_of_all for one in planes]),
-            np.array([one.piled_share if one.highest >= highest else 0.0 for one in planes]),
+            np.array([plane_level.mean for plane_level in planes]) - grown,
+            np.array([plane_level.temporal_variance_of_all for plane_level in planes]),
+            np.array([plane_level.piled_share if plane_level.highest >= highest else 0.0 for plane_level in planes]),
         )
         if unsaturated < LEAST_UNSATURATED:
             raise NotDetermined(Emva1288General.name, f"{unsaturated} unsaturated levels; three are needed at least")
-        found[name] = CharacteristicCurve(
+        points_of[name] = CharacteristicCurve(
             light=np.array([0.0, *series.amounts]),
-            mean=np.array([one.mean for one in planes]) - grown,
-            mean_std=np.hypot(own_std, light_std * signal),
-            variance=np.array([one.temporal_variance_of_all for one in planes]),
-            variance_std=np.array([one.temporal_variance_std for one in planes]),
-            spatial=np.array([_spatial_variance(one) for one in planes]),
+            mean=np.array([plane_level.mean for plane_level in planes]) - grown,
+            mean_std=np.hypot(mean_std, light_std * signal),
+            variance=np.array([plane_level.temporal_variance_of_all for plane_level in planes]),
+            variance_std=np.array([plane_level.temporal_variance_std for plane_level in planes]),
+            spatial=np.array([_spatial_variance(plane_level) for plane_level in planes]),
             unsaturated=unsaturated,
         )
-    return found, series.unit
+    return points_of, series.unit
 
 
 def _spatial_variance(plane: PlaneStatistics) -> float:
@@ -383,6 +383,6 @@ def _spatial_variance(plane: PlaneStatistics) -> float:
 def read(side: MeasuredSide) -> Iterator[Standard]:
     """Yield the standard for each plane. Raises NotDetermined where the recordings hold no series of levels."""
     curves, unit = characteristic_curves(side)
-    own = side.fit.noise.emva1288 if side.fit.noise is not None else {}
+    by_plane = side.fit.noise.emva1288 if side.fit.noise is not None else {}
     for plane, curve in curves.items():
-        yield Emva1288General(side, plane, curve, unit, own.get(plane))
+        yield Emva1288General(side, plane, curve, unit, by_plane.get(plane))

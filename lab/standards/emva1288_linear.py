@@ -63,9 +63,9 @@ class Emva1288Linear(Standard):
         ),
     )
 
-    def __init__(self, side: MeasuredSide, plane: str, own: Emva1288) -> None:
+    def __init__(self, side: MeasuredSide, plane: str, figures: Emva1288) -> None:
         super().__init__(side, f"plane {plane}")
-        self.own = own
+        self.own = figures
 
     def _of(self, field: str, unit: str, factor: float = 1.0) -> Estimate:
         value, std = getattr(self.own, field), getattr(self.own, f"{field}_std")
@@ -310,7 +310,7 @@ class Emva1288Linear(Standard):
             yield f"light of {self.own.wavelength_nm:g} nm"
 
     def remarks(self) -> Iterator[str]:
-        yield from (one for one in self.own.remarks if not any(phrase in one for phrase in OF_DEVIATIONS))
+        yield from (remark for remark in self.own.remarks if not any(phrase in remark for phrase in OF_DEVIATIONS))
         yield from self._gain_bias()
 
     def _gain_bias(self) -> Iterator[str]:
@@ -331,9 +331,9 @@ class Emva1288Linear(Standard):
         )
 
 
-def level_deviations(own: Emva1288) -> Iterator[Deviation]:
+def level_deviations(figures: Emva1288) -> Iterator[Deviation]:
     """Yield the requirements on the series of levels that a plane's recordings don't meet."""
-    points = own.points
+    points = figures.points
     levels = len(points.light)
     if levels < LEAST_LEVELS:
         yield Deviation(
@@ -343,7 +343,7 @@ def level_deviations(own: Emva1288) -> Iterator[Deviation]:
             limit=f"{LEAST_LEVELS} at least",
             remedy="capture more levels between the dark and saturation",
         )
-    if own.saturation_capacity_e is None:
+    if figures.saturation_capacity_e is None:
         yield Deviation(
             clause="6.5",
             quantity="range of the levels",
@@ -361,7 +361,7 @@ def level_deviations(own: Emva1288) -> Iterator[Deviation]:
             remedy="measure the irradiance by a photodiode in the plane of the sensor",
             figures=("quantum_efficiency", "responsivity", "dynamic_range", "saturation_capacity"),
         )
-    elif own.wavelength_nm is None:
+    elif figures.wavelength_nm is None:
         yield Deviation(
             clause="6.2",
             quantity="wavelength of the light",
@@ -371,7 +371,11 @@ def level_deviations(own: Emva1288) -> Iterator[Deviation]:
             figures=("quantum_efficiency", "responsivity"),
         )
     darks = np.array(points.dark_exposure_s)
-    missing = [one for one in set(points.exposure_s) if not np.any(np.abs(darks - one) <= SAME_EXPOSURE * one)]
+    missing = [
+        exposure_s
+        for exposure_s in set(points.exposure_s)
+        if not np.any(np.abs(darks - exposure_s) <= SAME_EXPOSURE * exposure_s)
+    ]
     if missing:
         yield Deviation(
             clause="6.5",
@@ -382,9 +386,9 @@ def level_deviations(own: Emva1288) -> Iterator[Deviation]:
         )
 
 
-def uniformity_deviations(own: Emva1288) -> Iterator[Deviation]:
+def uniformity_deviations(figures: Emva1288) -> Iterator[Deviation]:
     """Yield the requirement on the homogeneity of the light, where the spatial stack shows that it isn't met."""
-    span, std = own.light_nonuniformity_percent, own.light_nonuniformity_percent_std or 0.0
+    span, std = figures.light_nonuniformity_percent, figures.light_nonuniformity_percent_std or 0.0
     if span is None:
         yield Deviation(
             clause="6.1",
@@ -404,9 +408,9 @@ def uniformity_deviations(own: Emva1288) -> Iterator[Deviation]:
         )
 
 
-def stack_deviations(own: Emva1288) -> Iterator[Deviation]:
+def stack_deviations(figures: Emva1288) -> Iterator[Deviation]:
     """Yield the requirements on the spatial stacks that aren't met."""
-    points = own.points
+    points = figures.points
     images = [n for n in (points.stack_images, points.stack_dark_images) if n is not None]
     if points.stack_images is None:
         yield Deviation(
@@ -442,5 +446,5 @@ def read(side: MeasuredSide) -> Iterator[Standard]:
     """Yield the standard for each plane whose figures the noise fit has. Raises NotDetermined where none has."""
     if side.fit.noise is None or not side.fit.noise.emva1288:
         raise NotDetermined(Emva1288Linear.name, "no flats and darks in repeats; capture a photon-transfer series")
-    for plane, own in side.fit.noise.emva1288.items():
-        yield Emva1288Linear(side, plane, own)
+    for plane, figures in side.fit.noise.emva1288.items():
+        yield Emva1288Linear(side, plane, figures)

@@ -103,11 +103,11 @@ class Ieee1858(Standard):
         self.edge = edge
 
     def _acutance(self, condition: ViewingCondition) -> Estimate:
-        found = self.edge.unbiased
+        unbiased = self.edge.unbiased
         value, std = acutance(
-            found.frequency_cy_per_px,
-            found.mtf,
-            found.covariance,
+            unbiased.frequency_cy_per_px,
+            unbiased.mtf,
+            unbiased.covariance,
             condition.pixels_per_degree(self.measured.camera.rows),
         )
         if not np.isfinite(value):
@@ -151,15 +151,15 @@ class Ieee1858(Standard):
         )
 
     def conditions(self) -> Iterator[str]:
-        for one in (SCREEN, PRINT, TELEVISION):
-            shown = one.pixels_per_degree(self.measured.camera.rows)
-            yield f"{one.words()}: {shown:.3g} pixels a degree"
+        for viewing in (SCREEN, PRINT, TELEVISION):
+            shown = viewing.pixels_per_degree(self.measured.camera.rows)
+            yield f"{viewing.words()}: {shown:.3g} pixels a degree"
 
     def plots(self) -> Iterator[StandardPlot]:
-        found = self.edge.unbiased
+        unbiased = self.edge.unbiased
         per_degree = SCREEN.pixels_per_degree(self.measured.camera.rows)
-        kept = found.frequency_cy_per_px <= 0.5
-        f = found.frequency_cy_per_px[kept] * per_degree
+        kept = unbiased.frequency_cy_per_px <= 0.5
+        f = unbiased.frequency_cy_per_px[kept] * per_degree
         yield StandardPlot(
             title="Response and contrast sensitivity, screen at 100 %",
             x_label="frequency, cycles per degree",
@@ -168,8 +168,8 @@ class Ieee1858(Standard):
                 PlotCurve(
                     label="response",
                     x=tuple(f.tolist()),
-                    y=tuple(found.mtf[kept].tolist()),
-                    y_std=tuple(found.mtf_std[kept].tolist()),
+                    y=tuple(unbiased.mtf[kept].tolist()),
+                    y_std=tuple(unbiased.mtf_std[kept].tolist()),
                     style="points",
                     channel=self.edge.channel,
                 ),

@@ -109,7 +109,7 @@ def measure_e_sfr(
     place = np.arange(lines)
     edge = _edge_positions(values, window, order)
     line = np.polynomial.polynomial.Polynomial.fit(place, edge, 1)
-    if any(np.any((one < 1.0) | (one > n - 2.0)) for one in (edge, line(place))):
+    if any(np.any((ends < 1.0) | (ends > n - 2.0)) for ends in (edge, line(place))):
         raise NotDetermined("e-SFR", "the edge leaves the region: widen the region, or shorten it along the edge")
     tilt = float(line.deriv()(0.0))
     cosine = float(np.cos(np.arctan(tilt)))
@@ -168,12 +168,12 @@ def _edge_positions(values: FloatArray, window: Window, order: int) -> FloatArra
         cosine = np.cos(np.pi * np.clip(away, -1.0, 1.0))
         weight = 0.5 + 0.5 * cosine if window == "tukey" else 0.54 + 0.46 * cosine
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = (slope * weight) @ at / (slope * weight).sum(axis=1)
-        if not np.all(np.isfinite(found)):
+            centroid = (slope * weight) @ at / (slope * weight).sum(axis=1)
+        if not np.all(np.isfinite(centroid)):
             raise NotDetermined("e-SFR", "a line of the region has no edge: narrow the region to the edge")
         degree = min(order if number else 1, max(lines // 20, 1))
-        centre = np.polynomial.polynomial.Polynomial.fit(place, found, degree, domain=[-1.0, 1.0])(place)
-    scatter = float(np.sqrt(np.mean((found - centre) ** 2)))
+        centre = np.polynomial.polynomial.Polynomial.fit(place, centroid, degree, domain=[-1.0, 1.0])(place)
+    scatter = float(np.sqrt(np.mean((centroid - centre) ** 2)))
     if scatter > MOST_SCATTER_PX:
         raise NotDetermined(
             "e-SFR",
@@ -198,11 +198,11 @@ class EdgeRecord:
     @property
     def name(self) -> str:
         """The capture and the channel, with the middle of a region that was found."""
-        own = f"{self.capture.id}, {self.channel}"
+        name = f"{self.capture.id}, {self.channel}"
         if self.capture.region is not None:
-            return own
+            return name
         row0, col0, row1, col1 = self.region
-        return f"{own} at row {(row0 + row1) // 2}, column {(col0 + col1) // 2}"
+        return f"{name} at row {(row0 + row1) // 2}, column {(col0 + col1) // 2}"
 
     @cached_property
     def unbiased(self) -> EdgeMtf:
@@ -224,15 +224,15 @@ def edge_records(side: MeasuredSide) -> list[EdgeRecord]:
     groups: dict[object, list[SlantedEdgeCapture]] = {}
     for capture in side.recordings.captures(SlantedEdgeCapture, side.side):
         groups.setdefault((capture.region, capture.angle_deg, capture.exposure_s, capture.gain_db), []).append(capture)
-    found, reasons = [], ["no slanted_edge captures"]
+    readings, reasons = [], ["no slanted_edge captures"]
     for group in groups.values():
         try:
             first = group[0]
-            own = [first.region] if first.region else [e.region for e in edges_of(side.recordings, first)]
+            regions = [first.region] if first.region else [e.region for e in edges_of(side.recordings, first)]
         except NotDetermined as refused:
             reasons.append(refused.reason)
             continue
-        for region in own:
+        for region in regions:
             try:
                 summary = measure_edge(side.recordings, group, channel, side.fit.noise, region)
                 check_phases("e-SFR", camera.cfa, channel, region, summary.angle_deg)
@@ -242,10 +242,10 @@ def edge_records(side: MeasuredSide) -> list[EdgeRecord]:
             mean = np.mean([side.recordings.frame(c).astype(float) for c in group], axis=0)
             plane = region_planes(mean, region, camera.cfa, channel)[0]
             turned = plane.values.T if summary.curve.transposed else plane.values
-            found.append(EdgeRecord(first, channel, region, summary, np.asarray(turned, float), plane.step))
-    if not found:
+            readings.append(EdgeRecord(first, channel, region, summary, np.asarray(turned, float), plane.step))
+    if not readings:
         raise NotDetermined(Iso12233.name, reasons[-1])
-    return found
+    return readings
 
 
 class Iso12233(Standard):
@@ -334,10 +334,10 @@ class Iso12233(Standard):
         Clause: none. Symbol: MTF50. Unit: cy/px.
         Formula: of a spline profile fitted to all samples by least squares.
         """
-        found = self.edge.unbiased
-        if found.mtf50_cy_per_px is None:
+        unbiased = self.edge.unbiased
+        if unbiased.mtf50_cy_per_px is None:
             raise NotDetermined(self.name, "the response doesn't fall to 50 %")
-        return Estimate(value=found.mtf50_cy_per_px, std=found.mtf50_cy_per_px_std, unit="cy/px")
+        return Estimate(value=unbiased.mtf50_cy_per_px, std=unbiased.mtf50_cy_per_px_std, unit="cy/px")
 
     @ClauseFigure
     def sfr50_bias(self) -> Estimate:
@@ -346,9 +346,9 @@ class Iso12233(Standard):
         Clause: none. Symbol: δ. Unit: %.
         Formula: SFR50 / MTF50 − 1, both of the same samples.
         """
-        own, free = self.sfr50, self.unbiased_mtf50
-        ratio = own.value / free.value
-        std = ratio * float(np.hypot((own.std or 0.0) / own.value, (free.std or 0.0) / free.value))
+        biased, free = self.sfr50, self.unbiased_mtf50
+        ratio = biased.value / free.value
+        std = ratio * float(np.hypot((biased.std or 0.0) / biased.value, (free.std or 0.0) / free.value))
         return Estimate(value=100.0 * (ratio - 1.0), std=100.0 * std, unit="%")
 
     def deviations(self) -> Iterator[Deviation]:
@@ -459,26 +459,26 @@ class Iso12233Field(Standard):
     @cached_property
     def _each(self) -> list[tuple[float, float, float, float]]:
         """Row and column of the middle, SFR50 and its standard deviation, of each edge that has one."""
-        found = []
-        for one in self.edges:
+        places = []
+        for edge in self.edges:
             try:
-                value = one.sfr50
+                value = edge.sfr50
             except NotDetermined:
                 continue
-            row0, col0, row1, col1 = one.edge.region
-            found.append((0.5 * (row0 + row1), 0.5 * (col0 + col1), value.value, value.std or 0.0))
-        if not found:
+            row0, col0, row1, col1 = edge.edge.region
+            places.append((0.5 * (row0 + row1), 0.5 * (col0 + col1), value.value, value.std or 0.0))
+        if not places:
             raise NotDetermined(self.name, "no edge whose response falls to 50 %")
-        return found
+        return places
 
-    def _weighted(self, chosen: list[tuple[float, float, float, float]]) -> Estimate:
-        values = np.array([one[2] for one in chosen])
-        stds = np.array([one[3] for one in chosen])
+    def _average_weighted(self, chosen: list[tuple[float, float, float, float]]) -> Estimate:
+        values = np.array([place[2] for place in chosen])
+        stds = np.array([place[3] for place in chosen])
         return Estimate(value=float(values.mean()), std=float(np.sqrt(np.sum(stds**2))) / len(chosen), unit="cy/px")
 
-    def _radius(self, one: tuple[float, float, float, float]) -> float:
+    def _radius(self, place: tuple[float, float, float, float]) -> float:
         camera = self.measured.camera
-        return float(np.hypot(one[0] - camera.rows / 2.0, one[1] - camera.cols / 2.0)) / (
+        return float(np.hypot(place[0] - camera.rows / 2.0, place[1] - camera.cols / 2.0)) / (
             0.5 * float(np.hypot(camera.rows, camera.cols))
         )
 
@@ -489,10 +489,10 @@ class Iso12233Field(Standard):
         Clause: 6.2. Symbol: SFR50.centre. Unit: cy/px.
         Formula: mean over the edges within 0.3 of the half diagonal.
         """
-        chosen = [one for one in self._each if self._radius(one) <= 0.3]
+        chosen = [place for place in self._each if self._radius(place) <= 0.3]
         if not chosen:
             raise NotDetermined(self.name, "no edge within 0.3 of the half diagonal")
-        return self._weighted(chosen)
+        return self._average_weighted(chosen)
 
     @ClauseFigure
     def corner_sfr50(self) -> Estimate:
@@ -501,10 +501,10 @@ class Iso12233Field(Standard):
         Clause: 6.2. Symbol: SFR50.corner. Unit: cy/px.
         Formula: mean over the edges beyond 0.7 of the half diagonal.
         """
-        chosen = [one for one in self._each if self._radius(one) >= 0.7]
+        chosen = [place for place in self._each if self._radius(place) >= 0.7]
         if not chosen:
             raise NotDetermined(self.name, "no edge beyond 0.7 of the half diagonal")
-        return self._weighted(chosen)
+        return self._average_weighted(chosen)
 
     @ClauseFigure
     def lowest_sfr50(self) -> Estimate:
@@ -513,10 +513,10 @@ class Iso12233Field(Standard):
         Clause: 6.2. Symbol: SFR50.min. Unit: cy/px.
         Formula: least of all edges.
         """
-        return self._weighted([min(self._each, key=lambda one: one[2])])
+        return self._average_weighted([min(self._each, key=lambda place: place[2])])
 
     def deviations(self) -> Iterator[Deviation]:
-        yield from {one.line: one for edge in self.edges for one in edge.deviations()}.values()
+        yield from {deviation.line: deviation for edge in self.edges for deviation in edge.deviations()}.values()
 
     def maps(self) -> Iterator[StandardMap]:
         camera = self.measured.camera
@@ -540,6 +540,6 @@ class Iso12233Field(Standard):
 def read(side: MeasuredSide) -> Iterator[Standard]:
     """Yield the standard for each edge and for the frame. Raises NotDetermined where no edge is usable."""
     edges = [Iso12233(side, edge) for edge in edge_records(side)]
-    if measured_edges := [one for one in edges if one.has_response]:
+    if measured_edges := [edge for edge in edges if edge.has_response]:
         yield Iso12233Field(side, measured_edges)
     yield from edges

@@ -45,22 +45,22 @@ class Iso13655(Standard):
         self.spectra = spectra
 
     def _mean(self, values: list[float], unit: str) -> Estimate:
-        found = np.array(values)
-        if not np.all(np.isfinite(found)):
+        measured = np.array(values)
+        if not np.all(np.isfinite(measured)):
             raise NotDetermined(self.name, "the light has no visible part")
-        std = float(found.std(ddof=1) / np.sqrt(found.size)) if found.size > 1 else None
-        return Estimate(value=float(found.mean()), std=std, unit=unit)
+        std = float(measured.std(ddof=1) / np.sqrt(measured.size)) if measured.size > 1 else None
+        return Estimate(value=float(measured.mean()), std=std, unit=unit)
 
     def _chromaticities(self) -> list[np.ndarray]:
         colour = colour_science()
-        found = []
-        for one in self.spectra:
-            power = one.at(GRID_NM)
+        chromaticities = []
+        for spectrum in self.spectra:
+            power = spectrum.at(GRID_NM)
             if not power.sum() > 0:
                 raise NotDetermined(self.name, "the light has no visible part")
             white = Colorimetry.under(power, np.ones((1, GRID_NM.size))).white
-            found.append(np.asarray(colour.XYZ_to_xy(white)))
-        return found
+            chromaticities.append(np.asarray(colour.XYZ_to_xy(white)))
+        return chromaticities
 
     @ClauseFigure
     def luminance(self) -> Estimate:
@@ -69,7 +69,7 @@ class Iso13655(Standard):
         Clause: 5.2. Symbol: L_v. Unit: cd/m².
         Formula: 683 lm/W ∫ L(λ) V(λ) dλ, mean of the repeated measurements.
         """
-        return self._mean([luminance_cd_m2(one) for one in self.spectra], "cd/m²")
+        return self._mean([luminance_cd_m2(spectrum) for spectrum in self.spectra], "cd/m²")
 
     @ClauseFigure
     def chromaticity_x(self) -> Estimate:
@@ -78,7 +78,7 @@ class Iso13655(Standard):
         Clause: 5.2. Symbol: x. Unit: 1.
         Formula: X / (X + Y + Z) of the CIE's observer of 1931.
         """
-        return self._mean([float(one[0]) for one in self._chromaticities()], "1")
+        return self._mean([float(xy[0]) for xy in self._chromaticities()], "1")
 
     @ClauseFigure
     def chromaticity_y(self) -> Estimate:
@@ -87,7 +87,7 @@ class Iso13655(Standard):
         Clause: 5.2. Symbol: y. Unit: 1.
         Formula: Y / (X + Y + Z) of the CIE's observer of 1931.
         """
-        return self._mean([float(one[1]) for one in self._chromaticities()], "1")
+        return self._mean([float(xy[1]) for xy in self._chromaticities()], "1")
 
     @ClauseFigure
     def colour_temperature(self) -> Estimate:
@@ -97,7 +97,7 @@ class Iso13655(Standard):
         Formula: of the Planckian radiator nearest in u, v (McCamy's polynomial of x and y).
         """
         colour = colour_science()
-        return self._mean([float(colour.temperature.xy_to_CCT_McCamy1992(one)) for one in self._chromaticities()], "K")
+        return self._mean([float(colour.temperature.xy_to_CCT_McCamy1992(xy)) for xy in self._chromaticities()], "K")
 
     def deviations(self) -> Iterator[Deviation]:
         wave = self.spectra[0].arrays[0]
@@ -121,7 +121,7 @@ class Iso13655(Standard):
 
     def plots(self) -> Iterator[StandardPlot]:
         wave = self.spectra[0].arrays[0]
-        value = np.mean([one.at(wave) for one in self.spectra], axis=0)
+        value = np.mean([spectrum.at(wave) for spectrum in self.spectra], axis=0)
         yield StandardPlot(
             title="Radiance of the light",
             x_label="wavelength, nm",
@@ -135,14 +135,14 @@ def read(side: MeasuredSide) -> Iterator[Standard]:
     flats = side.recordings.captures(FlatCapture, side.side)
     charts = side.recordings.captures(ChartCapture, side.side)
     lights = {
-        "flat": [one.radiance for one in flats if one.radiance is not None and one.wavelength_nm is None],
-        "chart": [one.radiance for one in charts],
+        "flat": [flat.radiance for flat in flats if flat.radiance is not None and flat.wavelength_nm is None],
+        "chart": [chart.radiance for chart in charts],
     }
-    found = False
+    has_reading = False
     for kind, paths in lights.items():
         spectra = [side.recordings.spectrum(path) for path in dict.fromkeys(paths)]
         if spectra:
-            found = True
+            has_reading = True
             yield Iso13655(side, kind, spectra)
-    if not found:
+    if not has_reading:
         raise NotDetermined(Iso13655.name, "no white light was measured; measure its radiance by a spectroradiometer")

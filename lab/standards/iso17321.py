@@ -42,21 +42,21 @@ COEFFICIENTS = tuple(f"{row}{column}" for row in "XYZ" for column in CHANNELS)
 @cache
 def _observer() -> FloatArray:
     """Colour matching functions (wavelengths, 3) of the CIE's observer of 1931 on `GRID_NM`."""
-    found = colour_science().MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    return np.stack([np.interp(GRID_NM, found.wavelengths, found.values[:, k]) for k in range(3)], axis=1)
+    observer = colour_science().MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    return np.stack([np.interp(GRID_NM, observer.wavelengths, observer.values[:, k]) for k in range(3)], axis=1)
 
 
 @cache
 def _test_colours() -> FloatArray:
     """Reflectances (24, wavelengths) of the ColorChecker that the standard prints."""
-    own = colour_science().SDS_COLOURCHECKERS["ISO 17321-1"]
-    return np.stack([np.interp(GRID_NM, one.wavelengths, one.values) for one in own.values()])
+    patches = colour_science().SDS_COLOURCHECKERS["ISO 17321-1"]
+    return np.stack([np.interp(GRID_NM, curve.wavelengths, curve.values) for curve in patches.values()])
 
 
 def illuminant_power(name: str) -> FloatArray:
     """Return the relative power (wavelengths,) of one of the CIE's illuminants on `GRID_NM`."""
-    own = colour_science().SDS_ILLUMINANTS[name]
-    return np.asarray(np.interp(GRID_NM, own.wavelengths, own.values))
+    curve = colour_science().SDS_ILLUMINANTS[name]
+    return np.asarray(np.interp(GRID_NM, curve.wavelengths, curve.values))
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,8 @@ def fit_matrix(
     def residual(free: FloatArray) -> FloatArray:
         return np.asarray((truth.lab(balanced[used] @ matrix(free).T) - wanted).ravel())
 
-    found = optimize.least_squares(residual, begin[:, :2].ravel(), method="lm")
-    best = matrix(found.x)
+    solution = optimize.least_squares(residual, begin[:, :2].ravel(), method="lm")
+    best = matrix(solution.x)
     return ColourMatrix(best, float(truth.differences(balanced @ best.T)[used].mean()))
 
 
@@ -145,8 +145,8 @@ class Iso17321(Standard):
     def _unbiased(self, name: str) -> Estimate:
         """Return a figure of the matrix less what noise adds to it: differences have no sign, so that the draws lie
         higher than what they are drawn about by as much as this lies above the truth."""
-        own, drawn = getattr(self.fitted, name), np.array([getattr(one, name) for one in self.drawn])
-        return Estimate(value=float(2.0 * own - drawn.mean()), std=float(drawn.std(ddof=1)), unit="1")
+        fitted, drawn = getattr(self.fitted, name), np.array([getattr(draw, name) for draw in self.drawn])
+        return Estimate(value=float(2.0 * fitted - drawn.mean()), std=float(drawn.std(ddof=1)), unit="1")
 
     @ClauseFigure
     def smi(self) -> Estimate:
@@ -155,7 +155,7 @@ class Iso17321(Standard):
         Clause: Annex C. Symbol: SMI. Unit: 1.
         Formula: 100 − 5.5 times the mean CIELAB difference of the eighteen chromatic patches.
         """
-        return Estimate(value=self.fitted.smi, std=float(np.std([one.smi for one in self.drawn], ddof=1)), unit="1")
+        return Estimate(value=self.fitted.smi, std=float(np.std([draw.smi for draw in self.drawn], ddof=1)), unit="1")
 
     @ClauseFigure
     def mean_difference(self) -> Estimate:
@@ -173,13 +173,13 @@ class Iso17321(Standard):
         Clause: Annex C. Symbol: M(Y, G). Unit: 1.
         Formula: middle element of the matrix of least sum of squared CIELAB differences that keeps white.
         """
-        std = float(np.std([one.matrix[1, 1] for one in self.drawn], ddof=1))
+        std = float(np.std([draw.matrix[1, 1] for draw in self.drawn], ddof=1))
         return Estimate(value=float(self.fitted.matrix[1, 1]), std=std, unit="1")
 
     @cached_property
     def matrix_std(self) -> FloatArray:
         """Standard deviations (3, 3) of the matrix."""
-        return np.std([one.matrix for one in self.drawn], axis=0, ddof=1)
+        return np.std([draw.matrix for draw in self.drawn], axis=0, ddof=1)
 
     def remarks(self) -> Iterator[str]:
         rows = (
@@ -242,8 +242,8 @@ def from_curves(spectral: SpectralFit) -> tuple[ColourMatrix, list[ColourMatrix]
     truth = Colorimetry.under(power, _test_colours())
     weight = power * GRID_NM  # sensitivities are per photon
 
-    def signals(own: FloatArray) -> tuple[FloatArray, FloatArray]:
-        on_grid = np.stack([np.interp(GRID_NM, wave, one, left=0.0, right=0.0) for one in own]) * weight
+    def signals(curves: FloatArray) -> tuple[FloatArray, FloatArray]:
+        on_grid = np.stack([np.interp(GRID_NM, wave, curve, left=0.0, right=0.0) for curve in curves]) * weight
         return _test_colours() @ on_grid.T, on_grid.sum(axis=1)
 
     fitted = fit_matrix(*signals(value), truth)
@@ -272,8 +272,8 @@ def from_chart(side: MeasuredSide) -> tuple[ColourMatrix, list[ColourMatrix]]:
     place = {(p.name, p.channel): k for k, p in enumerate(first)}
     order = np.array([[place[name, channel] for channel in CHANNELS] for name in names])
     light: Spectrum = side.recordings.spectrum(first[0].captures[0].radiance)
-    own = reflectances("ColorChecker24")
-    truth = Colorimetry.under(light.at(GRID_NM), np.stack([own[name].at(GRID_NM) for name in names]))
+    patches = reflectances("ColorChecker24")
+    truth = Colorimetry.under(light.at(GRID_NM), np.stack([patches[name].at(GRID_NM) for name in names]))
     # the white patch stands for a perfect diffuser of its reflectance
     white_share = truth.patches[CHROMATIC] / truth.white
 

@@ -49,11 +49,11 @@ class Iso17850(Standard):
         if self.geometry.covariance is None:
             return None
         names = self.projection.names
-        own = [name for name in self.geometry.parameters if name in names]
-        found = np.zeros((len(names), len(names)))
-        at = [names.index(name) for name in own]
-        found[np.ix_(at, at)] = np.array(self.geometry.covariance)[: len(own), : len(own)]
-        return found
+        stated = [name for name in self.geometry.parameters if name in names]
+        covariance = np.zeros((len(names), len(names)))
+        at = [names.index(name) for name in stated]
+        covariance[np.ix_(at, at)] = np.array(self.geometry.covariance)[: len(stated), : len(stated)]
+        return covariance
 
     def _ideal(self, pixels: FloatArray, intrinsics: FloatArray) -> FloatArray:
         """Return where points recorded at `pixels` (n, 2: x, y) would be without distortion, px: a central projection
@@ -132,7 +132,7 @@ class Iso17850(Standard):
         its ends over the frame's size across it, positive outwards. `axis`: 0 of lines along x, 1 along y."""
         camera = self.measured.camera
         size = np.array([camera.cols - 1.0, camera.rows - 1.0])
-        found = []
+        readings = []
         for side in (0.0, 1.0):
             ends = np.zeros((2, 2))
             ends[1, axis] = size[axis]
@@ -147,8 +147,8 @@ class Iso17850(Standard):
             recorded = self.projection.project(points, intrinsics)[:, 1 - axis]
             outwards = 2.0 * side - 1.0
             bend = recorded[LINE_POINTS // 2] - 0.5 * (recorded[0] + recorded[-1])
-            found.append(outwards * bend / size[1 - axis])
-        return 100.0 * float(np.mean(found))
+            readings.append(outwards * bend / size[1 - axis])
+        return 100.0 * float(np.mean(readings))
 
     @ClauseFigure
     def horizontal_line_distortion(self) -> Estimate:
@@ -209,8 +209,8 @@ class Iso17850(Standard):
                 PlotCurve(
                     label="mean of the four diagonals",
                     x=tuple(share for share, _ in figures),
-                    y=tuple(one.value for _, one in figures),
-                    y_std=tuple(one.std or 0.0 for _, one in figures),
+                    y=tuple(estimate.value for _, estimate in figures),
+                    y_std=tuple(estimate.std or 0.0 for _, estimate in figures),
                     style="points",
                 ),
             ),

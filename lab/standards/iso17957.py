@@ -51,10 +51,10 @@ class Blocks:
             value = value / self.mean[other]
             relative = np.hypot(relative, self.std[other] / self.mean[other])
         middle = BLOCKS // 2
-        found = value / value[middle, middle]
-        std = found * np.hypot(relative, relative[middle, middle])
+        ratio = value / value[middle, middle]
+        std = ratio * np.hypot(relative, relative[middle, middle])
         std[middle, middle] = 0.0
-        return found, std
+        return ratio, std
 
 
 class Iso17957(Standard):
@@ -98,8 +98,8 @@ class Iso17957(Standard):
         corners, middle = ([0, 0, -1, -1], [0, -1, 0, -1]), BLOCKS // 2
         ratio = float(mean[corners].mean() / mean[middle, middle])
         # the error of the central block is common to the four
-        own = float(np.sqrt(np.sum(std[corners] ** 2))) / float(mean[corners].sum())
-        relative = float(np.hypot(own, std[middle, middle] / mean[middle, middle]))
+        corners_std = float(np.sqrt(np.sum(std[corners] ** 2))) / float(mean[corners].sum())
+        relative = float(np.hypot(corners_std, std[middle, middle] / mean[middle, middle]))
         return Estimate(value=100.0 * (ratio - 1.0), std=100.0 * ratio * relative, unit="%")
 
     def _colour(self, channel: str) -> Estimate:
@@ -194,9 +194,9 @@ def measure_blocks(side: MeasuredSide) -> Blocks:
         pixels = np.array(
             [[sum(cell[i][j].size for cell in cells) for j in range(BLOCKS)] for i in range(BLOCKS)], float
         )
-        own = mean[channel]
-        temporal = (data.noise.gain * np.maximum(own, 0.0) + data.noise.read_dn**2) / pixels / len(best)
-        std[channel] = np.sqrt(temporal + (data.noise.prnu * own) ** 2 / pixels)
+        channel_mean = mean[channel]
+        temporal = (data.noise.gain * np.maximum(channel_mean, 0.0) + data.noise.read_dn**2) / pixels / len(best)
+        std[channel] = np.sqrt(temporal + (data.noise.prnu * channel_mean) ** 2 / pixels)
     return Blocks(mean, std, len(best), level)
 
 

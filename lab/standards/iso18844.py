@@ -108,11 +108,13 @@ class Iso18844FromChart(Iso18844):
 
     def deviations(self) -> Iterator[Deviation]:
         if self.over_field is None or self.over_field < LEAST_CHART_OVER_FIELD:
-            found = "not known" if self.over_field is None else f"{100.0 * (self.over_field - 1.0):+.0f} % of the field"
+            departure = (
+                "not known" if self.over_field is None else f"{100.0 * (self.over_field - 1.0):+.0f} % of the field"
+            )
             yield Deviation(
                 clause="4.2",
                 quantity="extent of the white chart beyond the field of view",
-                found=found,
+                found=departure,
                 limit="+41 %",
                 remedy="bring the screen nearer, or take a larger one",
             )
@@ -207,11 +209,11 @@ def _from_charts(side: MeasuredSide, captures: list[FlareCapture]) -> Iterator[S
         chart = measure_flare_chart(planes[0], planes[1], (stds[0], stds[1]))
         # black levels of two frames differ by their repeatability, which no number of pixels reduces
         jitter = data.noise.jitter_dn * float(np.sqrt(1.0 / len(lit) + 1.0 / len(dark)))
-        found = FlareChart(
+        flare = FlareChart(
             chart.black_dn, float(np.hypot(chart.black_dn_std, jitter)), chart.white_dn,
             float(np.hypot(chart.white_dn_std, jitter)), chart.black_percent,
         )  # fmt: skip
-        yield Iso18844FromChart(side, channel, found, lit[0].chart_over_field)
+        yield Iso18844FromChart(side, channel, flare, lit[0].chart_over_field)
 
 
 def read(side: MeasuredSide) -> Iterator[Standard]:
@@ -221,14 +223,14 @@ def read(side: MeasuredSide) -> Iterator[Standard]:
     if charts:
         yield from _from_charts(side, charts)
         return
-    found: Observable = measure_screen(side.dataset)
-    white = np.asarray(found.scale)
-    usable = [k for k, label in enumerate(found.labels) if not label.held_out and white[k] > 0]
+    measured: Observable = measure_screen(side.dataset)
+    white = np.asarray(measured.scale)
+    usable = [k for k, label in enumerate(measured.labels) if not label.held_out and white[k] > 0]
     if not usable:
         raise NotDetermined(Iso18844.name, "no lit screen; capture white, black and a pattern of one pose")
-    share = found.value / white
-    covariance = found.covariance / np.outer(white, white)
+    share = measured.value / white
+    covariance = measured.covariance / np.outer(white, white)
     for channel in side.dataset.channels:
-        own = [k for k in usable if found.labels[k].channel == channel]
-        if own:
-            yield Iso18844(side, channel, share[own], covariance[np.ix_(own, own)])
+        of_channel = [k for k in usable if measured.labels[k].channel == channel]
+        if of_channel:
+            yield Iso18844(side, channel, share[of_channel], covariance[np.ix_(of_channel, of_channel)])

@@ -49,9 +49,11 @@ class Iso19084(Standard):
         Clause: 4.4. Symbol: RCD. Unit: %.
         Formula: 100 (r_channel − r_green) / half diagonal.
         """
-        own = self.largest_radial_displacement
+        largest = self.largest_radial_displacement
         factor = 100.0 / self.half_diagonal_px
-        return Estimate(value=factor * own.value, std=None if own.std is None else factor * own.std, unit="%")
+        return Estimate(
+            value=factor * largest.value, std=None if largest.std is None else factor * largest.std, unit="%"
+        )
 
     @ClauseFigure
     def centre_displacement(self) -> Estimate:
@@ -98,9 +100,9 @@ class Iso19084(Standard):
 def read(side: MeasuredSide) -> Iterator[Standard]:
     """Yield the standard for red and blue. Raises NotDetermined where the geometry has no channels of its own."""
     channels = [
-        one
-        for one in (side.fit.geometry.channels if side.fit.geometry is not None else ())
-        if one.radial_shift_px and one.channel != "G"
+        channel
+        for channel in (side.fit.geometry.channels if side.fit.geometry is not None else ())
+        if channel.radial_shift_px and channel.channel != "G"
     ]
     if not channels:
         raise NotDetermined(Iso19084.name, "no board was seen in several colours; capture a board with a colour camera")

@@ -53,14 +53,14 @@ class ClauseFigure(property):
     """A property that is a figure of a standard. Raises ValueError for a docstring that doesn't declare it."""
 
     def __init__(self, compute: Callable[[Any], Estimate]) -> None:
-        found = _DECLARED.search(compute.__doc__ or "")
-        if found is None:
+        declared = _DECLARED.search(compute.__doc__ or "")
+        if declared is None:
             raise ValueError(
                 f"{compute.__qualname__}: its docstring declares no figure; write 'Return the QUANTITY.', 'Clause: ... "
                 "Symbol: ... Unit: ....' and 'Formula: ....'"
             )
         super().__init__(compute)
-        words = {key: " ".join(text.split()) for key, text in found.groupdict().items()}
+        words = {key: " ".join(text.split()) for key, text in declared.groupdict().items()}
         self.declaration = Declaration(name=compute.__name__, **words)
 
 
@@ -85,8 +85,10 @@ class MeasuredSide:
     def instruments(self) -> tuple[str, ...]:
         """The instruments that took the recordings, one line each."""
         return tuple(
-            " ".join(part for part in (f"{name}:", one.maker, one.model, one.serial_number) if part)
-            for name, one in self.recordings.manifest.instruments.items()
+            " ".join(
+                part for part in (f"{name}:", instrument.maker, instrument.model, instrument.serial_number) if part
+            )
+            for name, instrument in self.recordings.manifest.instruments.items()
         )
 
 
@@ -148,16 +150,16 @@ class Standard:
     def read(self) -> StandardReading:
         """Return all that the standard says of the subject. Raises NotDetermined where no figure is determined."""
         deviations = tuple(self.deviations())
-        everywhere = any(not one.figures for one in deviations)
-        touched = {name for one in deviations for name in one.figures}
-        found = []
+        everywhere = any(not deviation.figures for deviation in deviations)
+        touched = {name for deviation in deviations for name in deviation.figures}
+        figures = []
         for name, declared in self.declarations().items():
             estimate, reason = None, ""
             try:
                 estimate = getattr(self, name)
             except NotDetermined as refused:
                 reason = refused.reason
-            found.append(
+            figures.append(
                 StandardFigure(
                     **vars(declared),
                     estimate=estimate,
@@ -165,14 +167,14 @@ class Standard:
                     by_the_standard=estimate is not None and not everywhere and name not in touched,
                 )
             )
-        if all(one.estimate is None for one in found):
-            raise NotDetermined(self.name, found[0].reason)
+        if all(figure.estimate is None for figure in figures):
+            raise NotDetermined(self.name, figures[0].reason)
         return StandardReading(
             standard=self.name,
             title=self.title,
             side=self.measured.side,
             subject=self.subject,
-            figures=tuple(found),
+            figures=tuple(figures),
             deviations=deviations,
             conditions=(*self.conditions(), *self.measured.instruments),
             remarks=tuple(self.remarks()),

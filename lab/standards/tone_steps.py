@@ -72,15 +72,15 @@ def slope_weights(x: FloatArray) -> FloatArray:
     """Return the weights (n, n) of values at `x` (n,), three or more, in the slope at each: that of the parabola
     through a point and its two neighbours."""
     n = x.size
-    found = np.zeros((n, n))
+    covariance = np.zeros((n, n))
     for k in range(n):
         at = np.arange(3) + min(max(k - 1, 0), n - 3)
         apart = x[at] - x[k]
         # derivative at 0 of the Lagrange polynomials of three nodes
         for i in range(3):
             others = np.delete(apart, i)
-            found[k, at[i]] = -(others[0] + others[1]) / np.prod(apart[i] - others)
-    return found
+            covariance[k, at[i]] = -(others[0] + others[1]) / np.prod(apart[i] - others)
+    return covariance
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def level_series(side: MeasuredSide, step: str) -> LevelSeries:
     Raises NotDetermined of `step` with fewer than four levels or without darks, in repeats each."""
     data = side.dataset
     noise = side.fit.noise
-    contradicting = {name for one in (noise.inconsistent_levels if noise else ()) for name in one.captures}
+    contradicting = {name for level in (noise.inconsistent_levels if noise else ()) for name in level.captures}
     groups = [
         group for group in data.flat_levels() if len(group) > 1 and not contradicting & {flat.id for flat in group}
     ]
@@ -129,8 +129,8 @@ def level_series(side: MeasuredSide, step: str) -> LevelSeries:
     return LevelSeries(
         amounts=np.array(amounts),
         unit=light[heads[0].id].unit,
-        amount_std=np.array([light[one.id].std for one in heads]),
-        exposure_s=np.array([one.exposure_s for one in heads]),
+        amount_std=np.array([light[capture.id].std for capture in heads]),
+        exposure_s=np.array([capture.exposure_s for capture in heads]),
         stacks=[data.flat_statistics(longest[amount]) for amount in amounts],
         darks=darks,
     )
@@ -148,7 +148,7 @@ def tone_steps(side: MeasuredSide, step: str) -> list[ToneSteps]:
     levels or without darks, in repeats each."""
     series = level_series(side, step)
     best = max(series.darks, key=lambda level: (level.repeats, -level.exposure_s))
-    found = []
+    steps = []
     for name, dark in best.plane.items():
         planes = [stack[name] for stack in series.stacks]
         below = side.dataset.noise.dark_dn_per_s * (series.exposure_s - best.exposure_s) + dark.mean
@@ -156,7 +156,7 @@ def tone_steps(side: MeasuredSide, step: str) -> list[ToneSteps]:
         middle = planes[int(np.argmin(np.abs(signal - 0.5 * signal.max())))]
         span, span_std = middle.shading_span
         level = middle.mean_of_all - dark.mean_of_all
-        found.append(
+        steps.append(
             ToneSteps(
                 plane=name,
                 exposure=series.amounts,
@@ -177,4 +177,4 @@ def tone_steps(side: MeasuredSide, step: str) -> list[ToneSteps]:
                 span_percent_std=100.0 * span_std / level,
             )
         )
-    return found
+    return steps

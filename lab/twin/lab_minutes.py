@@ -1,4 +1,4 @@
-"""Which sequence of a station reduces the error of a use most for a minute of lab time.
+"""Rank the sequences of a station by the reduction of an application's uncertainty per minute of lab time.
 
 Each sequence that the station can take measures numbers y = y(z) + noise of covariance S, J = dy / dz at the model.
 After it, the parameters' covariance V is (Rasmussen and Williams 2006, eq. 2.26)

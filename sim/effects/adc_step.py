@@ -14,7 +14,7 @@ from sim.stages import Codes
 
 PLACES = 64  # parts of the range, at whose borders a step is looked for first
 #: The counts of single codes change with the place within a code, and do so anew in the next one: only over several
-#: codes is the place told.
+#: codes the place is determined.
 SMOOTH_OVER_DN = 4.0
 
 

@@ -33,10 +33,10 @@ StatedFNumber = Annotated[
 def _is_told(field: FieldInfo) -> bool:
     types = [field.annotation]
     while types:
-        one = types.pop()
-        if get_origin(one) is Literal:
+        kind = types.pop()
+        if get_origin(kind) is Literal:
             return True
-        types += get_args(one)
+        types += get_args(kind)
     return field.annotation is int and any(hasattr(bound, "ge") or hasattr(bound, "le") for bound in field.metadata)
 
 

@@ -119,8 +119,8 @@ class ChargeTransferInefficiency(Effect):
         )  # fmt: skip
 
     def _releases(self, release_px: float) -> tuple[tuple[float, float], ...]:
-        one = (1.0 - self.slow_share, release_px)
-        return (one, (self.slow_share, self.slow_release_px)) if self.slow_share > 0.0 else (one,)
+        fast = (1.0 - self.slow_share, release_px)
+        return (fast, (self.slow_share, self.slow_release_px)) if self.slow_share > 0.0 else (fast,)
 
     def _trails(self) -> tuple[Trails, ...]:
         """Return the law of each direction that has a loss."""
@@ -146,7 +146,7 @@ class ChargeTransferInefficiency(Effect):
         """Return the charge's state with the noise that packets share by one of the laws, as it is in the mean of the
         frame."""
         camera, to_the_next = charge.camera, self.noise == "to the next packet"
-        own, first, second = law.noise((camera.rows, camera.cols)[law.axis], to_the_next)
+        variance, first, second = law.noise((camera.rows, camera.cols)[law.axis], to_the_next)
         at = [(1, 4), (0, 3)][law.axis]  # of `NEIGHBOURS`
         left = float(sum(share * np.exp(-1.0 / release) for share, release in law.releases))
 
@@ -161,6 +161,6 @@ class ChargeTransferInefficiency(Effect):
             return shared
 
         return charge.add_laws(
-            variance_e2=lambda electrons, variance_e2: variance_e2 * (1.0 - (1.0 - own) * filling(electrons)),
+            variance_e2=lambda electrons, variance_e2: variance_e2 * (1.0 - (1.0 - variance) * filling(electrons)),
             correlation=correlation,
         )

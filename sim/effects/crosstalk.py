@@ -74,8 +74,8 @@ class Crosstalk(Effect):
         """Return where the charge of a pixel ends up, (3, 3) of sum 1."""
         c = self.share_percent / 100.0
         along, down, across = c * (1.0 + self.row_excess), c * (1.0 - self.row_excess), c * self.corner_share
-        own = 1.0 - 2.0 * along - 2.0 * down - 4.0 * across
-        return np.array([[across, down, across], [along, own, along], [across, down, across]])
+        centre = 1.0 - 2.0 * along - 2.0 * down - 4.0 * across
+        return np.array([[across, down, across], [along, centre, along], [across, down, across]])
 
     def on_charge(self, charge: Charge) -> Charge:
         return charge if self.share_percent == 0.0 else charge.add_laws(kernels=self.kernel())

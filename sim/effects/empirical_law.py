@@ -179,9 +179,9 @@ class EmpiricalLaw(Effect):
         change = self._change
         if self.period:
             return np.concatenate([np.zeros(min(self.first, count)), np.resize(change, max(count - self.first, 0))])
-        found = np.zeros(max(count, self.first + len(change)))
-        found[self.first : self.first + len(change)] = change
-        return found[:count]
+        padded = np.zeros(max(count, self.first + len(change)))
+        padded[self.first : self.first + len(change)] = change
+        return padded[:count]
 
     def _over(self, shape: tuple[int, ...]) -> FloatArray:
         """Return the departure from no change shaped to broadcast over a frame of that shape."""

@@ -39,7 +39,7 @@ class InfraredCutFilter(Effect):
     ] = 1500.0
     width_nm: Annotated[
         float,
-        Quantity("nm", "wavelength over which the light falls by e behind the edge", lower=0.5, upper=40.0, absent=6.0),
+        Quantity("nm", "1/e width of the edge", lower=0.5, upper=40.0, absent=6.0),
     ] = 6.0
     steepening: Annotated[
         float,

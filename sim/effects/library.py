@@ -20,7 +20,7 @@ from sim.stages import laws_of
 @cache
 def effects() -> dict[str, type[Effect]]:
     """Name -> effect, in the order of the names."""
-    found: dict[str, type[Effect]] = {}
+    library: dict[str, type[Effect]] = {}
     for module in pkgutil.iter_modules(sim.effects.__path__):
         content = importlib.import_module(f"sim.effects.{module.name}")
         for item in vars(content).values():
@@ -30,13 +30,13 @@ def effects() -> dict[str, type[Effect]]:
                 and item.__module__ == content.__name__
                 and "name" in vars(item)  # not a base of several
             ):
-                found[item.name] = item
+                library[item.name] = item
     for name, kind in extensions("effects"):
-        if (why := _why_refused(name, kind, found)) is not None:
+        if (why := _why_refused(name, kind, library)) is not None:
             refuse("effects", name, why)
         else:
-            found[name] = kind
-    return dict(sorted(found.items()))
+            library[name] = kind
+    return dict(sorted(library.items()))
 
 
 def _why_refused(name: str, kind: object, known: Collection[str]) -> str | None:
@@ -49,7 +49,11 @@ def _why_refused(name: str, kind: object, known: Collection[str]) -> str | None:
 
 
 def effect(name: str) -> type[Effect]:
-    """Return the effect of that name; raises KeyError that lists the names there are."""
+    """Return the effect of a name. Raises KeyError that lists the names.
+
+    >>> effect("defocus").__name__
+    'Defocus'
+    """
     known = effects()
     if name not in known:
         raise KeyError(f"no effect named {name!r}; there are: {', '.join(known)}")
@@ -58,7 +62,11 @@ def effect(name: str) -> type[Effect]:
 
 @cache
 def members(family: Family) -> tuple[str, ...]:
-    """Names of the effects of a family that a diagnosis looks for."""
+    """List the names of the effects of a family that a diagnosis looks for.
+
+    >>> "row_noise" in members(effect("row_noise").family)
+    True
+    """
     return tuple(kind.name for kind in candidates() if kind.family is family)
 
 
@@ -88,8 +96,8 @@ def list_changes(effect: Effect) -> frozenset[str]:
 @cache
 def may_change(kind: type[Effect]) -> frozenset[str]:
     """Return which quantities of the stages an effect changes at any of its prototypes."""
-    every = (one for group in kind.prototypes(_CAMERA) for one in group)
-    return frozenset().union(*(list_changes(one) for one in every))
+    every = (effect for group in kind.prototypes(_CAMERA) for effect in group)
+    return frozenset().union(*(list_changes(effect) for effect in every))
 
 
 def typical(kind: type[Effect]) -> Effect:

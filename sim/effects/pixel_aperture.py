@@ -81,16 +81,16 @@ class PixelAperture(Effect):
 
         def transfer(fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float) -> FloatArray:
             fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float))
-            own = np.sinc(new * fx) * np.sinc(new * fy)
+            aperture = np.sinc(new * fx) * np.sinc(new * fy)
             if disc_share > 0.0:
                 q = 2.0 * np.sqrt(np.pi) * new * np.hypot(fx, fy)
                 disc = np.where(q > NULL, 2.0 * j1(q) / np.where(q > NULL, q, 1.0), 1.0)
-                own = (1.0 - disc_share) * own + disc_share * disc
-            own = own * np.exp(-2.0 * (np.pi * soft_share * new) ** 2 * (fx**2 + fy**2))
+                aperture = (1.0 - disc_share) * aperture + disc_share * disc
+            aperture = aperture * np.exp(-2.0 * (np.pi * soft_share * new) ** 2 * (fx**2 + fy**2))
             stated = np.sinc(side * fx) * np.sinc(side * fy)
             # at the stated aperture's nulls the ratio has no value, beside them it is large: the pixel's own transfer
             # makes up for it
             is_null = (np.abs(np.sinc(side * fx)) <= NULL) | (np.abs(np.sinc(side * fy)) <= NULL)
-            return np.asarray(np.where(is_null, 1.0, own / np.where(is_null, 1.0, stated)))
+            return np.asarray(np.where(is_null, 1.0, aperture / np.where(is_null, 1.0, stated)))
 
         return charge.add_laws(transfer=transfer)

@@ -113,8 +113,8 @@ class MeasuredIllumination(Frozen):
             py, px = (np.polynomial.legendre.legvander(axis, degree) for axis in (y, x))
             return np.stack([np.outer(py[:, i], px[:, j]).ravel() for i, j in terms], axis=1)
 
-        found = np.linalg.lstsq(design(y, x), means.ravel() / means.mean(), rcond=None)[0]
-        grid = design(np.linspace(-1.0, 1.0, nodes[0]), np.linspace(-1.0, 1.0, nodes[1])) @ found
+        coefficients = np.linalg.lstsq(design(y, x), means.ravel() / means.mean(), rcond=None)[0]
+        grid = design(np.linspace(-1.0, 1.0, nodes[0]), np.linspace(-1.0, 1.0, nodes[1])) @ coefficients
         return cls(values=tuple(map(tuple, grid.reshape(nodes).tolist())))
 
     @cached_property

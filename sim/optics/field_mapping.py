@@ -210,8 +210,8 @@ def field_function(table: LensTable, value: FloatArray) -> Callable[[FloatArray,
         return along_radius
     fy, fx = table.grid_shape
     splines = [
-        RectBivariateSpline(np.arange(fy), np.arange(fx), one.reshape(fy, fx), kx=min(3, fy - 1), ky=min(3, fx - 1))
-        for one in value.reshape(-1, fy * fx)
+        RectBivariateSpline(np.arange(fy), np.arange(fx), values.reshape(fy, fx), kx=min(3, fy - 1), ky=min(3, fx - 1))
+        for values in value.reshape(-1, fy * fx)
     ]
 
     def over_plane(x_um: FloatArray, y_um: FloatArray) -> FloatArray:

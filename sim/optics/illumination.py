@@ -11,8 +11,15 @@ from sim.spectrum import FloatArray
 
 
 def irradiance_factor(f_number: float, magnification: float = 0.0) -> float:
-    """Image irradiance over scene radiance (sr) of a lossless lens on axis: pi / (1 + 4 N^2 (1 + |m|)^2), as in
-    ISETCam.
+    """Compute image irradiance over scene radiance of a lossless lens on the axis, pi / (1 + 4 N^2 (1 + |m|)^2), as
+    in ISETCam.
+
+    f_number : N; magnification : m
+
+    Returns sr.
+
+    >>> round(irradiance_factor(4.0), 5)  # pi / 65
+    0.04833
     """
     return np.pi / (1.0 + 4.0 * f_number**2 * (1.0 + abs(magnification)) ** 2)
 

@@ -285,8 +285,8 @@ class MeasuredOtf(Frozen):
 
         table = RegularGridInterpolator((y, x), value if self.phase_rad else np.real(value), bounds_error=False,
                                         fill_value=0.0)  # fmt: skip
-        found = table(np.stack([across, np.abs(fx)], axis=-1))
-        return np.asarray(np.where(turned < 0, np.conj(found), found) * ratio)
+        sampled = table(np.stack([across, np.abs(fx)], axis=-1))
+        return np.asarray(np.where(turned < 0, np.conj(sampled), sampled) * ratio)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
         """Return the highest frequency of the samples."""
@@ -355,9 +355,6 @@ class TracedLens(Frozen):
 Imaging = Annotated[
     DiffractionLimited | ZernikePupil | MeasuredPsf | MeasuredOtf | TracedLens, Field(discriminator="kind")
 ]
-
-
-# --- samples ---------------------------------------------------------------------------------------------------------
 
 
 def _check_wavelengths(wavelength_nm: tuple[float, ...], *, empty: bool = False) -> None:

@@ -132,8 +132,8 @@ def point_spread(
         intensity = (rows[0] @ columns.T) ** 2 + (rows[1] @ columns.T) ** 2
         intensity = np.concatenate([intensity, intensity[:, : samples - half][:, ::-1]], axis=1)
     else:
-        one = np.ones(rays.cosine_x.size)
-        columns = _waves(k * rays.cosine_x * first, k * rays.cosine_x * pitch, one, samples)
+        ones = np.ones(rays.cosine_x.size)
+        columns = _waves(k * rays.cosine_x * first, k * rays.cosine_x * pitch, ones, samples)
         wave = (rows[0] + 1j * rows[1]) @ (columns[0] + 1j * columns[1]).T
         intensity = wave.real**2 + wave.imag**2
     scale = (rays.wavelength_nm * 1e-6 / rays.index) ** 2 * rays.energy

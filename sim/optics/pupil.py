@@ -449,9 +449,9 @@ def _octave(angle: float, shape: Wavefront, octave: int) -> ComplexArray | None:
     while count <= SIZES:
         node = np.cos(np.pi * (np.arange(count) + 0.5) / count)
         series = [_expand(angle, shape, float(low + 0.5 * (at + 1.0) * (high - low))) for at in node]
-        table = np.zeros((count, max(len(one) for one in series)), complex)
-        for k, one in enumerate(series):
-            table[k, : len(one)] = one
+        table = np.zeros((count, max(len(coefficients) for coefficients in series)), complex)
+        for k, terms in enumerate(series):
+            table[k, : len(terms)] = terms
         table = _to_series(count) @ table
         if np.max(np.sum(np.abs(table[-2:]), axis=1)) < SETTLED:
             return np.asarray(table)

@@ -56,7 +56,7 @@ class Surfaces(NamedTuple):
     stop_radius: float
 
 
-def compiled_surfaces(prescription: Prescription, stop_radius_mm: float, image_shift_mm: float = 0.0) -> Surfaces:
+def compile_surfaces(prescription: Prescription, stop_radius_mm: float, image_shift_mm: float = 0.0) -> Surfaces:
     """Arrays of a prescription; the image surface is a plane, `image_shift_mm` behind where the file has it."""
     surfaces = prescription.surfaces
     count = len(surfaces)

@@ -57,7 +57,7 @@ def superpose(
             f"the margin of {grid.margin_px} px is below the limit of {halo} px that the lens's window of "
             f"{2 * kernels.radius_um:g} um asks for: take a wider margin"
         )
-    seen = kernels.through_pixels(picture)
+    through_pixels = kernels.through_pixels(picture)
     taps = _taps_in_circle(kernels)
     for tile in kernels.tiles(grid) if tiles is None else tiles:
         top, bottom, left, right = tile.top, tile.bottom, tile.left, tile.right
@@ -69,7 +69,7 @@ def superpose(
         # wider, as taps come in fours and pixels in blocks
         wide = (right + halo) * s + half + 4 - origin[1] + BLOCK_PX * stride
         local = np.zeros((high, -(-wide // stride) * stride), np.float32)
-        part = seen[
+        part = through_pixels[
             (top + grid.margin_px) * s : (bottom + grid.margin_px) * s,
             (left + grid.margin_px) * s : (right + grid.margin_px) * s,
         ]

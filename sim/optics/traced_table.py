@@ -95,7 +95,7 @@ def lens_table(
     return OpticalTable(OpticalSystem(prescription, settings.focus), settings).table(progress, each)
 
 
-def cached_table(
+def read_or_trace_table(
     prescription: Prescription, folder: Path, settings: TableSettings | None = None, progress: Progress | None = None
 ) -> LensTable:
     """Return the table of a lens from the cache folder; computed and stored there where it is missing or damaged."""
@@ -205,13 +205,13 @@ class OpticalTable:
         psf = np.zeros((w_count, f_count, n, n))
         centroid = np.zeros((w_count, f_count, 2))
         points = list(zip(self.tangents, self._starts(), strict=True))
-        told: dict[int, tuple[str, ...]] = {}
-        found = each(self.traced_field, points) if each else ((f, self.traced_field(p)) for f, p in enumerate(points))
-        for f, point in found:
+        warnings_at: dict[int, tuple[str, ...]] = {}
+        traced = each(self.trace_field, points) if each else ((f, self.trace_field(p)) for f, p in enumerate(points))
+        for f, point in traced:
             chief[f], window[f], solid[:, f] = point.chief_mm, point.window_um, point.solid_angle
-            centroid[:, f], psf[:, f], told[f] = point.centroid_um, point.psf, point.warnings
+            centroid[:, f], psf[:, f], warnings_at[f] = point.centroid_um, point.psf, point.warnings
             if progress is not None:
-                progress(f"field {len(told)} of {f_count}", len(told) / f_count)
+                progress(f"field {len(warnings_at)} of {f_count}", len(warnings_at) / f_count)
         share = psf.sum(axis=(2, 3))
         w, f = divmod(int(np.argmin(share)), f_count)
         if share[w, f] < LEAST_SHARE:
@@ -240,12 +240,14 @@ class OpticalTable:
             encircled_share=share,
             centroid_um=centroid,
             warnings=tuple(
-                dict.fromkeys([*system.warnings, *(w for f in sorted(told) for w in told[f]), *self.warnings])
+                dict.fromkeys(
+                    [*system.warnings, *(w for f in sorted(warnings_at) for w in warnings_at[f]), *self.warnings]
+                )
             ),
             content_hash=content_hash(system.prescription, settings),
         )
 
-    def traced_field(self, point: tuple[Point, Point]) -> TracedField:
+    def trace_field(self, point: tuple[Point, Point]) -> TracedField:
         """Trace a field point, given as its tangents and the pupil point of its chief ray."""
         (tangent, start), system, n = point, self.system, self.settings.samples
         before = len(system.warnings)
@@ -279,16 +281,16 @@ class OpticalTable:
         """Pupil points of the field points' chief rays, found from the centre outwards."""
         system = self.system
         if self._line_only:
-            found = system.starts(self.tangents, system.reference_nm)
+            starts = system.starts(self.tangents, system.reference_nm)
         else:
-            found = []
+            starts = []
             for tx, ty in self.tangents:
                 spoke = [(tx * share, ty * share) for share in (0.0, 0.5, 1.0)]
-                found.append(system.starts(spoke, system.reference_nm)[-1])
-        lost = [tangent for tangent, place in zip(self.tangents, found, strict=True) if place is None]
+                starts.append(system.starts(spoke, system.reference_nm)[-1])
+        lost = [tangent for tangent, place in zip(self.tangents, starts, strict=True) if place is None]
         if lost:
             raise PrescriptionError(f"the chief ray at {field_angles(lost[0])} is lost; ask for a smaller field")
-        return [place for place in found if place is not None]
+        return [place for place in starts if place is not None]
 
     def _centre(self, tangent: tuple[float, float], start: tuple[float, float]) -> tuple[float, float]:
         centre = self.system.open_centre(tangent, [self._nodes[0], self.system.reference_nm, self._nodes[-1]], start)
@@ -317,11 +319,14 @@ class OpticalTable:
         """
         traced = [self._pupil(tangent, w, centre, span) for w in self._nodes]
         if len({rays.area.size for rays in traced}) == 1 and len({rays.rim_cosine_x.size for rays in traced}) == 1:
-            found = interpolate_rays(traced, self.wavelengths, [self.system.index(w)[-2] for w in self.wavelengths])
+            interpolated = interpolate_rays(
+                traced, self.wavelengths, [self.system.index(w)[-2] for w in self.wavelengths]
+            )
             if all(
-                abs(p.solid_angle / s - 1.0) < _SOLID_ANGLE_TOLERANCE for p, s in zip(found, solid_angle, strict=True)
+                abs(p.solid_angle / s - 1.0) < _SOLID_ANGLE_TOLERANCE
+                for p, s in zip(interpolated, solid_angle, strict=True)
             ):
-                return found
+                return interpolated
         return [self._pupil(tangent, w, centre, span) for w in self.wavelengths]
 
 

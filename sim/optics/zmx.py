@@ -72,8 +72,8 @@ class _SurfaceBlock:
     lines: list[tuple[str, str]] = field(default_factory=list)
 
     def last(self, keyword: str) -> str | None:
-        found = [rest for name, rest in self.lines if name == keyword]
-        return found[-1] if found else None
+        values = [rest for name, rest in self.lines if name == keyword]
+        return values[-1] if values else None
 
 
 def decode(data: bytes) -> str:
@@ -237,16 +237,16 @@ class _Reader:
                 primary_wavelength_nm=primary,
                 catalogues=tuple((self._header("GCAT") or "").upper().split()),
                 paraxial_stop=int(_optional(self._header("RAIM") or "", 1)) == 1,
-                stated_focal_length_mm=self._stated_focal_length(),
-                stated_stop_mm=self._stated_stop(self.blocks[stops[0]]),
+                stated_focal_length_mm=self._read_focal_length(),
+                stated_stop_mm=self._read_stop(self.blocks[stops[0]]),
                 warnings=tuple(dict.fromkeys(self.warnings)),
             )
 
     # --- header -------------------------------------------------------------------------------------------------------
 
     def _header(self, keyword: str) -> str | None:
-        found = [rest for name, rest in self.header if name == keyword]
-        return found[-1] if found else None
+        values = [rest for name, rest in self.header if name == keyword]
+        return values[-1] if values else None
 
     def _check_header(self) -> None:
         for keyword, rest in self.header:
@@ -358,7 +358,7 @@ class _Reader:
             raise PrescriptionError(f"header: PWAV {primary} is none of the {len(wavelengths)} wavelengths; correct it")
         return wavelengths, wavelengths[primary - 1]
 
-    def _stated_focal_length(self) -> float | None:
+    def _read_focal_length(self) -> float | None:
         """Return the focal length that the file's merit function asks for with a weight, if it does."""
         for keyword, rest in self.tail:
             if keyword in ("EFLY", "EFLX", "EFFL"):
@@ -367,7 +367,7 @@ class _Reader:
                     return target * self.scale
         return None
 
-    def _stated_stop(self, stop: _SurfaceBlock) -> float | None:
+    def _read_stop(self, stop: _SurfaceBlock) -> float | None:
         """Return the stop's semi-diameter where it is fixed or was found by aiming rays at the stop: else it is the
         beams' extent.
         """
@@ -450,14 +450,14 @@ class _Reader:
         return 0.0 if stated is None else _number(stated, keyword, meaning, where) * self.scale
 
     def _parameters(self, block: _SurfaceBlock, where: str) -> dict[int, float]:
-        found: dict[int, float] = {}
+        parameters: dict[int, float] = {}
         for keyword, rest in block.lines:
             if keyword == "PARM":
                 value = _number(rest, "PARM", "value", where, 1)
                 if not math.isfinite(value):
                     raise PrescriptionError(f"{where}: PARM {rest} isn't finite; correct it")
-                found[int(_number(rest, "PARM", "number", where))] = value
-        return found
+                parameters[int(_number(rest, "PARM", "number", where))] = value
+        return parameters
 
     def _extended_terms(self, block: _SurfaceBlock, where: str) -> dict[int, float]:
         """Return the coefficients of r^2, r^4, ... of an extended asphere: those of its extra data over powers of its

@@ -115,7 +115,7 @@ def project_means(pattern, back, row, col, step, divide, lit, surround, out):  #
 
 
 @njit(cache=True, nogil=True)
-def mapped_means(pattern, u, v, divide, lit, surround, out):  # type: ignore[no-untyped-def]
+def average_mapped(pattern, u, v, divide, lit, surround, out):  # type: ignore[no-untyped-def]
     """As `project_means`, for squares at given pattern points `u`, `v`, a frame of one square wider than needed all
     round; (rows x divide + 2, cols x divide + 2) for `out` of (rows, cols).
     """
@@ -196,7 +196,7 @@ def means_down(values, edges, begin, end, surround):  # type: ignore[no-untyped-
 
 
 @njit(cache=True)
-def tapered_rings(down, across, down2, across2, start, end, out):  # type: ignore[no-untyped-def]
+def draw_tapered_rings(down, across, down2, across2, start, end, out):  # type: ignore[no-untyped-def]
     """1/2 + 1/2 Re(down across) from complex factors by row and column, tapering to 1/2 between the distances `start`
     and `end`; `down2`, `across2` are squared distances of rows and columns from the centre."""
     for i in range(out.shape[0]):

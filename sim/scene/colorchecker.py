@@ -28,7 +28,11 @@ FRAME_REFLECTANCE = Spectrum(wavelength_nm=(200.0, 1200.0), value=(0.03, 0.03))
 
 
 def grid(chart: str = "ColorChecker24") -> tuple[int, int]:
-    """Rows and columns of a chart's patches. Raises ValueError for a chart that isn't known."""
+    """Return the numbers of rows and columns of a chart's patches. Raises ValueError for a chart that isn't known.
+
+    >>> grid("ColorChecker24")
+    (4, 6)
+    """
     known = {"ColorChecker24": GRID, "ColorCheckerSG": GRID_SG}
     if chart not in known:
         raise ValueError(
@@ -89,14 +93,14 @@ def recover_reflectances(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it says that it takes its own wavelengths, which are these
             start = colour.recovery.XYZ_to_sd_Otsu2018(wanted, cmfs=observer, illuminant=light).values
-        found = lsq_linear(system, np.append(slope @ start, weight * wanted), bounds=(0.0, 1.0), method="bvls")
-        left = float(np.max(np.abs(found.x @ to_xyz - wanted)))
+        solution = lsq_linear(system, np.append(slope @ start, weight * wanted), bounds=(0.0, 1.0), method="bvls")
+        left = float(np.max(np.abs(solution.x @ to_xyz - wanted)))
         if left > 1e-5:
             raise ValueError(
                 f"XYZ {np.round(wanted, 4).tolist()} under D50 is {left:.2g} beyond any reflectance between 0 and 1: "
                 "check the values, and that Y of white is 1"
             )
-        curves.append(np.clip(found.x, 0.0, 1.0))
+        curves.append(np.clip(solution.x, 0.0, 1.0))
     return np.asarray(observer.wavelengths), np.array(curves)
 
 

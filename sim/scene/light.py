@@ -31,7 +31,15 @@ def _photopic() -> Spectrum:
 
 
 def luminance_cd_m2(radiance: Spectrum) -> float:
-    """683 lm/W x integral of radiance (W sr^-1 m^-2 nm^-1) x V(wavelength), V of the CIE's observer of 1924."""
+    """Compute the luminance of a radiance, 683 lm/W x integral of L V, V of the CIE's observer of 1924.
+
+    radiance : L, W sr^-1 m^-2 nm^-1
+
+    Returns cd/m^2.
+
+    >>> round(luminance_cd_m2(Spectrum.of([554.5, 555.0, 555.5], [0.0, 2.0, 0.0])), 1)  # 1 W/(sr m^2) where V is 1
+    683.0
+    """
     photopic = _photopic()
     knots = np.unique(np.concatenate([radiance.arrays[0], photopic.arrays[0]]))
     # both are linear between the knots: Simpson's rule is exact for their product
@@ -41,7 +49,15 @@ def luminance_cd_m2(radiance: Spectrum) -> float:
 
 
 def at_luminance(curve: Spectrum, wanted_cd_m2: float) -> Spectrum:
-    """Return a spectral curve of any scale, scaled to a luminance. Raises ValueError for one without visible light."""
+    """Scale a spectral curve of any unit to a luminance.
+
+    curve : any unit over nm; wanted_cd_m2 : cd/m^2
+
+    Returns W sr^-1 m^-2 nm^-1. Raises ValueError for a curve without visible light.
+
+    >>> round(luminance_cd_m2(at_luminance(Spectrum.of([400.0, 700.0], [1.0, 1.0]), 100.0)), 6)
+    100.0
+    """
     if not (np.isfinite(wanted_cd_m2) and wanted_cd_m2 >= 0):
         raise ValueError(f"luminance {wanted_cd_m2} cd/m^2 is below the limit of 0 or not finite: give cd/m^2")
     has = luminance_cd_m2(curve)
@@ -53,25 +69,32 @@ def at_luminance(curve: Spectrum, wanted_cd_m2: float) -> Spectrum:
     return curve.scale(wanted_cd_m2 / has)
 
 
-def _added_illuminants() -> dict[str, Spectrum]:
+def _load_illuminants() -> dict[str, Spectrum]:
     """Return the illuminants of other packages, by name in small letters: entry points of `calibench.illuminants` that
     are spectra."""
-    found = {}
+    illuminants = {}
     for name, spectrum in extensions("illuminants"):
         if isinstance(spectrum, Spectrum):
-            found[name.lower()] = spectrum
+            illuminants[name.lower()] = spectrum
         else:
             refuse("illuminants", name, f"{spectrum!r} is no sim.spectrum.Spectrum")
-    return found
+    return illuminants
 
 
 def illuminant(name: str, luminance_cd_m2: float) -> Spectrum:
-    """Radiance (W sr^-1 m^-2 nm^-1) of a perfect white diffuser under a named illuminant (D65, A, FL2, LED-B1, ...), at
-    the given luminance. Raises ValueError that lists the names for one that isn't known.
+    """Compute the radiance of a perfect white diffuser under a named illuminant.
+
+    name : D65, A, FL2, LED-B1, ... (colour-science's), or an entry point of `calibench.illuminants`
+    luminance_cd_m2 : cd/m^2
+
+    Returns W sr^-1 m^-2 nm^-1. Raises ValueError that lists the names for one that isn't known.
+
+    >>> round(luminance_cd_m2(illuminant("D65", 100.0)), 6)
+    100.0
     """
     known = colour_science().SDS_ILLUMINANTS
     matching = {key.lower(): key for key in known}
-    added = _added_illuminants()
+    added = _load_illuminants()
     if name.lower() not in matching and name.lower() in added:
         return at_luminance(added[name.lower()], luminance_cd_m2)
     if name.lower() not in matching:

@@ -97,15 +97,15 @@ class Projection:
                 f"distortion has {len(distortion)} coefficients, and the {self.kind} projection takes "
                 f"{' '.join(self.coefficients)}: fit with those"
             )
-        matrix, found = np.asarray(camera_matrix, float), np.zeros(COUNT)
-        found[:4] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-        found[self._places[: len(distortion)]] = distortion
-        return found
+        matrix, intrinsics = np.asarray(camera_matrix, float), np.zeros(COUNT)
+        intrinsics[:4] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+        intrinsics[self._places[: len(distortion)]] = distortion
+        return intrinsics
 
     def distortion(self, intrinsics: Array) -> FloatArray:
         """Return the distortion coefficients; of a pinhole five, or eight where the denominator of g is used."""
-        found = np.asarray(intrinsics, float)[self._places]
-        return found[:5] if self.kind == "pinhole" and not np.any(found[5:]) else found
+        coefficients = np.asarray(intrinsics, float)[self._places]
+        return coefficients[:5] if self.kind == "pinhole" and not np.any(coefficients[5:]) else coefficients
 
     @cached_property
     def _spline(self) -> BSpline:
@@ -158,11 +158,11 @@ class Projection:
             scale = 2.0 / (length + z)
             by_rho, by_z = -0.5 * scale**2 / length, -scale / length
         # (x, y) scale(rho, z): `by_rho` is the derivative of the scale by rho, over rho
-        found = np.empty((len(points), 2, 3))
-        found[:, 0, 0], found[:, 1, 1] = scale + x * x * by_rho, scale + y * y * by_rho
-        found[:, 0, 1] = found[:, 1, 0] = x * y * by_rho
-        found[:, 0, 2], found[:, 1, 2] = x * by_z, y * by_z
-        return found
+        jacobian = np.empty((len(points), 2, 3))
+        jacobian[:, 0, 0], jacobian[:, 1, 1] = scale + x * x * by_rho, scale + y * y * by_rho
+        jacobian[:, 0, 1] = jacobian[:, 1, 0] = x * y * by_rho
+        jacobian[:, 0, 2], jacobian[:, 1, 2] = x * by_z, y * by_z
+        return jacobian
 
     def rays(self, x: Array, y: Array) -> FloatArray:
         """Return the rays (n, 3) of length 1 to places (n,) in the ideal plane; NaN beyond the sphere."""
@@ -193,21 +193,21 @@ class Projection:
 
     def _radial_terms(self, r2: Array, k: Array) -> FloatArray:
         """Return dg by each of the six radial coefficients (n, 6), 0 where one isn't used."""
-        found = np.zeros((*r2.shape, 6))
+        derivatives = np.zeros((*r2.shape, 6))
         if self.kind == "pinhole":
             g = self._radial(r2, k)[0]
             below = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
             for power in (1, 2, 3):
-                found[..., power - 1] = r2**power / below
-                found[..., power + 2] = -g * r2**power / below
+                derivatives[..., power - 1] = r2**power / below
+                derivatives[..., power + 2] = -g * r2**power / below
         elif self.kind == "equidistant":
             for power in (1, 2, 3, 4):
-                found[..., power - 1] = r2**power
+                derivatives[..., power - 1] = r2**power
         else:
             at = r2 / self._square_end
             end = np.minimum(at, 1.0)  # beyond its end the spline goes on as a straight line
-            found[...] = self._spline(end) + self._spline(end, 1) * (at - end)[..., None]
-        return found
+            derivatives[...] = self._spline(end) + self._spline(end, 1) * (at - end)[..., None]
+        return derivatives
 
     def distort(self, x: Array, y: Array, k: Array) -> tuple[FloatArray, FloatArray]:
         """Return where the distortion moves places (n,) of the ideal plane to. `k` (8,): places 4.. of the

@@ -97,7 +97,7 @@ def draw(scene: Scene, grid: Grid) -> Drawing:
     elif isinstance(scene, PlanarTarget):
         lit = cells(np.asarray(scene.texture, float), scene.warp(), grid, scene.surround)
     elif isinstance(scene, KnifeEdge | PosedEdges):
-        lit = _edges(scene, grid) if isinstance(scene, KnifeEdge) else _posed_edges(scene, grid)
+        lit = _edges(scene, grid) if isinstance(scene, KnifeEdge) else _cut_posed_edges(scene, grid)
     elif isinstance(scene, ZonePlate):
         lit = _zone_plate(scene, grid)
     elif isinstance(scene, SiemensStar):
@@ -114,10 +114,16 @@ def draw(scene: Scene, grid: Grid) -> Drawing:
 
 
 def half_plane(distance: FloatArray, slope_x: FloatArray | float, slope_y: FloatArray | float) -> FloatArray:
-    """Share of unit squares on the positive side of the line g = 0, exactly.
+    """Compute the share of unit squares on the positive side of the line g = 0, exactly: the distribution function
+    of the sum of two uniform variables of widths |slope_x| and |slope_y|.
 
-    `distance` is g at the squares' centres, g = distance + slope_x x + slope_y y with x, y in -1/2..1/2. The share is
-    the distribution function of the sum of two uniform variables of widths a = |slope_x|, b = |slope_y|.
+    distance : g at the squares' centres; slope_x, slope_y : of g = distance + slope_x x + slope_y y, x and y in
+        -1/2..1/2
+
+    Returns the share, 0..1, of the shape of `distance`.
+
+    >>> half_plane(np.array([-1.0, 0.0, 0.25, 1.0]), 1.0, 0.0).round(6).tolist()
+    [0.0, 0.5, 0.75, 1.0]
     """
     a, b = np.abs(slope_x), np.abs(slope_y)
     far = np.broadcast_to(0.5 * (a + b), np.shape(distance))
@@ -157,7 +163,7 @@ def cell_means(
     rest having `surround`; None: all of it."""
     if warp.is_upright:
         return _upright_means(pattern, warp, grid, surround, lit)
-    from sim.scene.area import mapped_means, project_means  # here: the compiler's library takes a while to load
+    from sim.scene.area import average_mapped, project_means  # here: the compiler's library takes a while to load
 
     divide = max(1, int(np.ceil(_footprint(pattern.shape, warp, grid) / 0.999)))
     if divide > MOST_DIVISIONS:
@@ -184,7 +190,7 @@ def cell_means(
         down = (row[part, None] + offset).ravel()
         down = np.concatenate([[down[0] - fine], down, [down[-1] + fine]])
         u, v = mapper(down)
-        mapped_means(pattern, u, v, divide, lit, surround, out[part[0] : part[-1] + 1])
+        average_mapped(pattern, u, v, divide, lit, surround, out[part[0] : part[-1] + 1])
     return out
 
 
@@ -214,11 +220,11 @@ def _footprint(shape: tuple[int, ...], warp: Warp, grid: Grid) -> float:
     u, v = np.meshgrid(np.linspace(0.0, cols, 9), np.linspace(0.0, rows, 9))
     row, col = warp.to_camera(u, v)
     axis_row, axis_col = grid.axes_px()
-    seen = (row >= axis_row[0]) & (row <= axis_row[-1]) & (col >= axis_col[0]) & (col <= axis_col[-1])
-    if not np.any(seen):
+    is_inside = (row >= axis_row[0]) & (row <= axis_row[-1]) & (col >= axis_col[0]) & (col <= axis_col[-1])
+    if not np.any(is_inside):
         # The grid may lie inside one cell, or off the pattern: ask at the grid's middle.
-        row, col, seen = np.array([np.mean(axis_row)]), np.array([np.mean(axis_col)]), np.array([True])
-    row, col = row[seen], col[seen]
+        row, col, is_inside = np.array([np.mean(axis_row)]), np.array([np.mean(axis_col)]), np.array([True])
+    row, col = row[is_inside], col[is_inside]
     h = 0.5 / grid.oversample
     (ua, va), (ub, vb) = warp.to_pattern(row - h, col), warp.to_pattern(row + h, col)
     (uc, vc), (ud, vd) = warp.to_pattern(row, col - h), warp.to_pattern(row, col + h)
@@ -272,9 +278,9 @@ def _screen(scene: ScreenImage, grid: Grid) -> Drawing:
         Layer((light, None), EVERYWHERE, cell_means(picture, warp, grid, 0.0, lit)) for light, picture, lit in pictures
     )
     if screen.falloff_exponent:
-        seen = scene.cosine(*grid.axes_px()) ** screen.falloff_exponent
+        falloff = scene.cosine(*grid.axes_px()) ** screen.falloff_exponent
         for layer in drawn:
-            np.multiply(layer.coverage, seen, out=layer.coverage)
+            np.multiply(layer.coverage, falloff, out=layer.coverage)
     return Drawing((NO_LIGHT, None), drawn)
 
 
@@ -291,7 +297,7 @@ def _edges(scene: KnifeEdge, grid: Grid) -> FloatArray:
     return lit
 
 
-def _posed_edges(scene: PosedEdges, grid: Grid) -> FloatArray:
+def _cut_posed_edges(scene: PosedEdges, grid: Grid) -> FloatArray:
     """Every sample is cut by the edge's line at that position, by exact area."""
     owner, away = scene.distances(*grid.axes_px())
     lit = np.empty(grid.shape)
@@ -328,7 +334,7 @@ def _zone_plate(scene: ZonePlate, grid: Grid) -> FloatArray:
     Its mean over a square is a product of two Fresnel integrals, exactly; the taper near the border, which is smooth,
     is taken at the square's centre.
     """
-    from sim.scene.area import tapered_rings
+    from sim.scene.area import draw_tapered_rings
 
     if scene.highest_cy_per_px > 0.5 * grid.oversample:
         raise ValueError(
@@ -344,7 +350,7 @@ def _zone_plate(scene: ZonePlate, grid: Grid) -> FloatArray:
         parts.append((np.diff(cosine) + 1j * np.diff(sine)) / (np.sqrt(2.0 * k) * step))
         squares.append((axis - centre) ** 2)
     lit = np.empty(grid.shape)
-    tapered_rings(*parts, *squares, (1.0 - scene.taper) * scene.radius_px, scene.radius_px, lit)
+    draw_tapered_rings(*parts, *squares, (1.0 - scene.taper) * scene.radius_px, scene.radius_px, lit)
     return lit
 
 

@@ -26,19 +26,19 @@ class CoupledAmplifiers:
     turned: bool
     of_noise: bool = False
 
-    def _stacked(self, frame: FloatArray) -> FloatArray:
+    def _stack_areas(self, frame: FloatArray) -> FloatArray:
         """Areas (areas, rows, cols) of a frame in reading order."""
         rows, cols = frame.shape[0] // self.down, frame.shape[1] // self.across
-        found = []
+        areas = []
         for i in range(self.down):
             for j in range(self.across):
                 area = frame[i * rows : (i + 1) * rows, j * cols : (j + 1) * cols]
                 if self.turned:
                     area = area[:: -1 if i % 2 else 1, :: -1 if j % 2 else 1]
-                found.append(area)
-        return np.array(found)
+                areas.append(area)
+        return np.array(areas)
 
-    def _placed(self, areas: FloatArray, frame: FloatArray) -> FloatArray:
+    def _place_areas(self, areas: FloatArray, frame: FloatArray) -> FloatArray:
         """A copy of a frame with these areas."""
         out, (rows, cols) = np.array(frame), areas.shape[1:]
         for k, area in enumerate(areas):
@@ -54,11 +54,11 @@ class CoupledAmplifiers:
 
     def couple(self, frame: FloatArray) -> FloatArray:
         """Return what is read of a frame's signals (rows, cols)."""
-        areas = self._stacked(frame)
-        return self._placed((areas + np.einsum("ij,jrc->irc", self.coupling, areas)) / self._whole, frame)
+        areas = self._stack_areas(frame)
+        return self._place_areas((areas + np.einsum("ij,jrc->irc", self.coupling, areas)) / self._whole, frame)
 
     def couple_variances(self, frame: FloatArray) -> FloatArray:
         """Return the variances of what is read, of independent pixels of these variances (rows, cols)."""
-        areas = self._stacked(frame)
+        areas = self._stack_areas(frame)
         squared = np.square(self.coupling)
-        return self._placed((areas + np.einsum("ij,jrc->irc", squared, areas)) / self._whole**2, frame)
+        return self._place_areas((areas + np.einsum("ij,jrc->irc", squared, areas)) / self._whole**2, frame)

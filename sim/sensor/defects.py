@@ -14,7 +14,15 @@ from sim.spectrum import FloatArray
 
 @lru_cache(maxsize=8)
 def defective_pixels(shape: tuple[int, ...], share: float, seed: int) -> NDArray[np.intp]:
-    """Flat indices of round(share x pixels) different pixels, at least one, in random order."""
+    """Choose round(share x pixels) different pixels, at least one, in random order.
+
+    shape : of the frame; share : 0..1; seed : of the choice
+
+    Returns flat indices.
+
+    >>> len(defective_pixels((10, 10), 0.05, 1))
+    5
+    """
     pixels = int(np.prod(shape))
     count = min(max(round(share * pixels), 1), pixels)
     chosen = np.random.default_rng([seed, 1]).choice(pixels, count, replace=False)
@@ -45,8 +53,17 @@ def defect_sizes(shape: tuple[int, ...], share: float, seed: int, spread: float 
 
 @lru_cache(maxsize=256)
 def size_nodes(spread: float, count: int = 48) -> tuple[FloatArray, FloatArray]:
-    """(weights, sizes), (count,) each, of the distribution of `defect_sizes`: means over parts of it, narrower ones
-    towards the tail. The weights and the weighted sizes sum to 1."""
+    """Compute a quadrature of the distribution of `defect_sizes`: means over parts of it, narrower ones towards the
+    tail.
+
+    spread : relative standard deviation; count : number of parts
+
+    Returns weights and sizes, (count,) each. The weights and the weighted sizes sum to 1.
+
+    >>> weights, sizes = size_nodes(1.0)
+    >>> round(float(weights.sum()), 9), round(float(weights @ sizes), 9)
+    (1.0, 1.0)
+    """
     if spread < ALIKE:
         return np.ones(1), np.ones(1)
     k = spread**-2

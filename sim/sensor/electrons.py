@@ -174,17 +174,22 @@ def capacity_e(camera: CameraModel, gain_db: float = 0.0) -> float:
     return min(camera.full_well_e, (camera.white_level_dn - camera.black_level_dn) / gain)
 
 
-def clipped_moments(
+def clip_moments(
     mean: FloatArray, variance: FloatArray, lower: float, upper: float, skewness: FloatArray | float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance of a variable after clipping to [lower, upper] (either may be infinite): normal, but for a
-    small `skewness` g.
+    """Compute mean and variance of a variable after clipping, which is normal but for a small skewness g.
+
+    mean, variance, skewness : arrays that broadcast; lower, upper : the limits, either may be infinite
 
     With standardised limits a and b, density phi and distribution function Phi of the normal distribution: E z = a
     Phi(a) + b (1 - Phi(b)) - phi(b) + phi(a), E z^2 = a^2 Phi(a) + b^2 (1 - Phi(b)) + Phi(b) - Phi(a) - b phi(b) + a
     phi(a). A density times 1 + g (z^3 - 3 z) / 6 adds, to first order in g, g (a phi(a) - b phi(b)) / 6 and g ((1 +
     a^2) phi(a) - (1 + b^2) phi(b)) / 3. Values more than eight standard deviations from the limits are returned
     unchanged.
+
+    >>> mean, variance = clip_moments(np.zeros(1), np.ones(1), 0.0, np.inf)
+    >>> round(float(mean[0]), 4), round(float(variance[0]), 4)  # 1 / sqrt(2 pi), 1/2 - 1 / (2 pi)
+    (0.3989, 0.3408)
     """
     mean, variance, skewness = np.broadcast_arrays(
         np.asarray(mean, float), np.asarray(variance, float), np.asarray(skewness, float)
@@ -208,20 +213,26 @@ def clipped_moments(
     return out_mean, out_variance
 
 
-def coded_moments(
+def encode_moments(
     mean: FloatArray, variance: FloatArray, highest: float, skewness: FloatArray | float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance of a variable (normal, but for a small `skewness`) after rounding to whole numbers and clipping
-    to [0, highest], which may be infinite.
+    """Compute mean and variance of a variable, normal but for a small skewness, after rounding to whole numbers and
+    clipping.
+
+    mean, variance, skewness : arrays that broadcast, DN, DN^2, 1; highest : the highest code, DN, may be infinite
 
     With a standard deviation of 0.9 and more (1 near a limit): mean and variance of the clipped variable, and what
     rounding adds. With f the density and P the share between the limits a = 0 and b that is f(b) / 24 - f(a) / 24 to
     the mean and P / 12 + (M - a) f(a) / 12 + (b - M) f(b) / 12 to the variance (sums of the distribution function at
     half codes as integrals, by Euler and Maclaurin): 1/12 far from the limits. Narrower: far from the limits by
     `_round_moments`, near them the sum over the codes within 8. Good to 1e-3 DN at a limit and 1e-6 DN far from any.
+
+    >>> mean, variance = encode_moments(np.array([100.0]), np.array([4.0]), 4095.0)
+    >>> round(float(mean[0]), 6), round(float(variance[0]), 6)  # rounding adds 1/12
+    (100.0, 4.083333)
     """
     mean, variance = np.broadcast_arrays(np.asarray(mean, float), np.asarray(variance, float))
-    out_mean, out_variance = clipped_moments(mean, variance, 0.0, highest, skewness)
+    out_mean, out_variance = clip_moments(mean, variance, 0.0, highest, skewness)
     narrow = variance < 0.81
     wide = ~narrow
     out_variance[wide] += 1.0 / 12.0
@@ -289,7 +300,7 @@ def dn_moments(
     """Mean (DN, that of the rounded codes) and temporal variance (DN^2) of pixels with mean `electrons`.
 
     Shot noise is Poisson; clipping (at full well, or by the converter where that comes first) and rounding are averaged
-    over the noise (`clipped_moments`, `coded_moments`): to first order in its skewness, and not over single electrons
+    over the noise (`clip_moments`, `encode_moments`): to first order in its skewness, and not over single electrons
     that are wider than the read noise and a code. The variance goes through the response by its slope. `fixed_pattern`:
     the moments of those pixels, in place of pixels that are all alike; then `dark_electrons` of `electrons` are dark
     current.
@@ -309,7 +320,7 @@ def dn_moments(
     if by_charge:
         # to DN as it is, as the full well's own noise is none: what is clipped isn't clipped again
         skewness = electrons / np.maximum(noise, 1e-12) ** 1.5
-        mean, variance = clipped_moments(electrons, noise, -np.inf, camera.full_well_e, np.minimum(skewness, 1.0))
+        mean, variance = clip_moments(electrons, noise, -np.inf, camera.full_well_e, np.minimum(skewness, 1.0))
     if read_out.response is not None:
         beyond = mean + (1e-3 * mean + 1e-3)
         bent = read_out.response(mean)
@@ -333,7 +344,7 @@ def dn_moments(
         dn = filter_planes(dn, read_out.processing, camera.cfa)
         dn2 = filter_planes(np.broadcast_to(dn2, dn.shape), np.square(read_out.processing), camera.cfa)
     skewness = np.minimum(electrons / np.maximum(noise_e2, 1e-12) ** 1.5, 1.0)
-    return coded_moments(dn, dn2, np.inf if by_charge else camera.white_level_dn, skewness)
+    return encode_moments(dn, dn2, np.inf if by_charge else camera.white_level_dn, skewness)
 
 
 #: Equal parts of a normal distribution over which a converter's law is averaged.
@@ -381,7 +392,7 @@ def sample_from(
     check_electrons(electrons)
     frame = np.empty(electrons.shape, np.uint16)
     dark = np.broadcast_to(np.asarray(dark_electrons, np.float32), electrons.shape)
-    added = _added_electrons(electrons.shape, camera, rng, read_out)
+    added = _draw_added_electrons(electrons.shape, camera, rng, read_out)
     gain = np.float32(gain_dn_per_e(camera, gain_db))
     rows = max(1, 32_768 // max(1, electrons.shape[-1]))  # strips that stay in the processor's cache
     if read_out.neighbours is not None or read_out.processing is not None or read_out.amplifiers is not None:
@@ -413,7 +424,7 @@ def sample_from(
     return frame
 
 
-def _added_electrons(
+def _draw_added_electrons(
     shape: tuple[int, ...], camera: CameraModel, rng: np.random.Generator, read_out: ReadOut
 ) -> Float32Array | None:
     """Electrons that one frame's read-out adds besides every pixel's own read noise: row noise, and noise of
@@ -435,8 +446,8 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
         wanted = np.maximum(read_out.shot_e2(mean.astype(float)), 0.0)
         charge = (mean + (charge - mean) * np.sqrt(wanted / np.maximum(mean, 1e-12))).astype(np.float32)
     if read_out.neighbours is not None:
-        shares = passed_shares(read_out.neighbours, mean.astype(float))
-        charge = (mean + shared_departures(charge - mean, mean, shares)).astype(np.float32)
+        shares = interpolate_passed_shares(read_out.neighbours, mean.astype(float))
+        charge = (mean + share_departures(charge - mean, mean, shares)).astype(np.float32)
     np.minimum(charge, np.float32(camera.full_well_e), out=charge)
     if read_out.multiplied.excess != 1.0:
         charge = read_out.multiplied.draw(charge, rng)
@@ -474,17 +485,17 @@ def _products() -> tuple[tuple[tuple[int, int], ...], ...]:
     """For each kind of neighbour, the pairs of kinds whose shares' product adds to its covariance, one pair for each
     pair of places; the pixel itself isn't among them."""
     places = [(kind, place) for kind, every in enumerate(NEIGHBOURS) for place in every]
-    found = []
+    pairs_of_kind = []
     for first, *_ in NEIGHBOURS:
-        found.append(
+        pairs_of_kind.append(
             tuple(
-                (one, other)
-                for one, (down, right) in places
-                for other, (below, beside) in places
-                if (down - below, right - beside) == first
+                (this, other)
+                for this, (down, right) in places
+                for other, (below, beyond) in places
+                if (down - below, right - beyond) == first
             )
         )
-    return tuple(found)
+    return tuple(pairs_of_kind)
 
 
 _PRODUCTS = _products()
@@ -501,13 +512,13 @@ def solve_passed_share(correlation: FloatArray) -> FloatArray:
     counts = [len(places) for places in NEIGHBOURS]
     g = 0.5 * r
     for _ in range(SHARE_STEPS):
-        squares = sum((m * np.square(one) for m, one in zip(counts, g, strict=True)), np.ones(r.shape[1:]))
+        squares = sum((m * np.square(shares) for m, shares in zip(counts, g, strict=True)), np.ones(r.shape[1:]))
         mixed = [sum((g[a] * g[b] for a, b in pairs), np.zeros(r.shape[1:])) for pairs in _PRODUCTS]
         g = 0.5 * (r * squares - np.array(mixed))
     return np.asarray(g)
 
 
-def passed_shares(correlation: Callable[[FloatArray], FloatArray], mean: FloatArray) -> FloatArray:
+def interpolate_passed_shares(correlation: Callable[[FloatArray], FloatArray], mean: FloatArray) -> FloatArray:
     """Return the shares (5, rows, cols) of `solve_passed_share` in a frame of `mean` electrons (rows, cols).
 
     correlation : mean electrons (...) -> correlations (5, ...), linear between `SHARE_LEVELS` levels
@@ -517,7 +528,7 @@ def passed_shares(correlation: Callable[[FloatArray], FloatArray], mean: FloatAr
     return np.array([np.interp(mean, levels, of_kind) for of_kind in shares])
 
 
-def shared_departures(departure: NDArray[F], mean: NDArray[F], shares: FloatArray) -> FloatArray:
+def share_departures(departure: NDArray[F], mean: NDArray[F], shares: FloatArray) -> FloatArray:
     """Deviations (rows, cols) of Poisson variables of given means after every pixel has taken over a share of its
     neighbours', with unchanged variances: d_i + sum g_i d_j, over sqrt(1 + sum g_i^2 v_j / v_i). `shares` (5, rows,
     cols): of each neighbour, by `NEIGHBOURS`."""

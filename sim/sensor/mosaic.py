@@ -17,15 +17,22 @@ PERIOD_PX = 48
 
 
 def step(cfa: Cfa) -> int:
-    """Period of the mosaic in px: 2, or 1 of a MONO sensor."""
+    """Return the period of the mosaic, px: 2, or 1 of a MONO sensor.
+
+    >>> step("RGGB"), step("MONO")
+    (2, 1)
+    """
     return 1 if cfa == "MONO" else 2
 
 
 def phases(cfa: Cfa) -> dict[str, list[tuple[int, int]]]:
-    """Channel -> [(row0, col0), ...]: positions of the channel's pixels in the mosaic's period, from pixel [0, 0].
+    """List the positions of each channel's pixels in the mosaic's period, from pixel [0, 0].
 
-    R and B have one phase, G two (first the one on the red rows); MONO: `{"Y": [(0, 0)]}`. A phase's pixels are
-    `frame[row0::step, col0::step]` with `step(cfa)`.
+    Returns channel -> [(row0, col0), ...]: R and B have one phase, G two (first the one on the red rows), MONO has
+    Y. A phase's pixels are `frame[row0::step, col0::step]` with `step(cfa)`.
+
+    >>> phases("RGGB")
+    {'R': [(0, 0)], 'G': [(0, 1), (1, 0)], 'B': [(1, 1)]}
     """
     if cfa == "MONO":
         return {"Y": [(0, 0)]}
@@ -40,7 +47,11 @@ def phases(cfa: Cfa) -> dict[str, list[tuple[int, int]]]:
 
 
 def first_pixels(cfa: Cfa) -> dict[str, tuple[int, int]]:
-    """Return where the first pixel (row, column) of each plane of a mosaic is, by the names that `planes` has."""
+    """Return the first pixel (row, column) of each plane of a mosaic, by the names that `planes` has.
+
+    >>> first_pixels("GRBG")
+    {'R': (0, 1), 'G1': (0, 0), 'G2': (1, 1), 'B': (1, 0)}
+    """
     if cfa == "MONO":
         return {"Y": (0, 0)}
     at = phases(cfa)
@@ -48,15 +59,29 @@ def first_pixels(cfa: Cfa) -> dict[str, tuple[int, int]]:
 
 
 def planes(frame: NDArray[Scalar], cfa: Cfa) -> dict[str, NDArray[Scalar]]:
-    """Return the mosaic taken apart, as views of `frame` (..., rows, cols): `R`, `G1` (green on red rows), `G2` (green
-    on blue rows), `B`; or `Y` of a MONO sensor."""
+    """Take a mosaic apart into its planes, as views of the frame.
+
+    frame : (..., rows, cols)
+
+    Returns `R`, `G1` (green on red rows), `G2` (green on blue rows), `B`; or `Y` of a MONO sensor.
+
+    >>> {name: plane.tolist() for name, plane in planes(np.array([[1, 2], [3, 4]]), "RGGB").items()}
+    {'R': [[1]], 'G1': [[2]], 'G2': [[3]], 'B': [[4]]}
+    """
     period = step(cfa)
     return {name: frame[..., row::period, col::period] for name, (row, col) in first_pixels(cfa).items()}
 
 
 def assemble(channels: Mapping[str, NDArray[Scalar]], cfa: Cfa) -> NDArray[Scalar]:
-    """One frame from full images of each channel (`R`, `G`, `B` or `Y`, all (rows, cols)): every pixel takes the value
-    of its own channel. On these pixels it is the inverse of `planes`."""
+    """Assemble a frame from full images of each channel: every pixel takes the value of its own channel.
+
+    channels : `R`, `G`, `B` or `Y`, all (rows, cols)
+
+    Returns (rows, cols). Raises ValueError for a missing channel, and for images of different shapes.
+
+    >>> assemble({c: np.full((2, 2), k) for k, c in enumerate("RGB")}, "RGGB").tolist()
+    [[0, 1], [1, 2]]
+    """
     places = phases(cfa)
     missing = [channel for channel in places if channel not in channels]
     if missing:

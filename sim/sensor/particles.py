@@ -110,14 +110,14 @@ class ParticlesOfFrame:
 
     def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         """Draw the electrons of one frame; what a track leaves beyond the rim is lost."""
-        found = np.zeros(shape)
+        electrons_of_frame = np.zeros(shape)
         number = rng.poisson(self.law.expected_number(shape[0] * shape[1], self.pitch_um, self.exposure_s))
         for _ in range(int(number)):
             rows, cols, electrons = self.law.draw_event(rng, self.pitch_um)
             rows, cols = rows + rng.integers(shape[0]), cols + rng.integers(shape[1])
             inside = (rows >= 0) & (rows < shape[0]) & (cols >= 0) & (cols < shape[1])
-            np.add.at(found, (rows[inside], cols[inside]), electrons[inside])
-        return found
+            np.add.at(electrons_of_frame, (rows[inside], cols[inside]), electrons[inside])
+        return electrons_of_frame
 
     def mean_e(self, shape: tuple[int, ...]) -> float:
         """Mean of every pixel, without the rim's loss."""

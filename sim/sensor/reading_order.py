@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from sim.sensor.alternating_rows import AlternatingRows
 from sim.spectrum import FloatArray
 
 #: Pixels that are drawn for each one that is read: the ends of a frame have nothing in common.
@@ -66,7 +67,7 @@ class OrderedNoise:
             return np.zeros(shape)
         size = shape[0] * shape[1]
         count = fft.next_fast_len(FOLDED * size, real=True)
-        power = _averaged(count, self._shape)
+        power = _average_power(count, self._shape)
         wave = fft.irfft(fft.rfft(rng.standard_normal(count)) * np.sqrt(power), count)
         return np.asarray(std * wave[:size].reshape(shape))
 
@@ -127,6 +128,10 @@ class OrderedNoise:
         return float(self._mixed(_departures_apart(self._shape, shape, period, apart, turned)))
 
 
+#: Noise of the read-out that depends on the place of a pixel in the order in which pixels are read.
+ReadOutNoise = OrderedNoise | AlternatingRows
+
+
 # Responses (2, ...) to the common and to the alternating noise of 1 e. A fit moves both sizes much more often than the
 # law, so they are kept by law.
 
@@ -140,13 +145,13 @@ def _shown(law: PowerLaw, waves_cy_per_px: FloatArray, shape: tuple[int, int]) -
     """The spectrum as frames show it, which end: near a pole, with what leaks down the rows."""
     rows, cols = shape
     f = _from_whole(waves_cy_per_px)
-    found = []
+    powers = []
     for away, across in ((f, cols), (_from_whole(2.0 * f), cols // 2)):
         near = _leaking((rows, across), law)
         cycles = away * across * rows  # a frame, or its even or odd columns
         smooth = law.power(np.maximum(cycles, 0.5) / (rows * across))
-        found.append(np.where(cycles < 0.5 * rows, np.interp(cycles, np.arange(len(near)), near), smooth))
-    return np.stack(found)
+        powers.append(np.where(cycles < 0.5 * rows, np.interp(cycles, np.arange(len(near)), near), smooth))
+    return np.stack(powers)
 
 
 @lru_cache(maxsize=256)
@@ -177,10 +182,10 @@ def _down_rows(law: PowerLaw, shape: tuple[int, int], down: bytes) -> FloatArray
 
 @lru_cache(maxsize=16)
 def _covariances(law: PowerLaw) -> FloatArray:
-    own = fft.irfft(_averaged(GRID, law), GRID)[: GRID // 2]
-    apart = np.zeros(len(own))
-    apart[::2] = own[: len(own) // 2]
-    return np.stack([own, apart])
+    consecutive = fft.irfft(_average_power(GRID, law), GRID)[: GRID // 2]
+    apart = np.zeros(len(consecutive))
+    apart[::2] = consecutive[: len(consecutive) // 2]
+    return np.stack([consecutive, apart])
 
 
 @lru_cache(maxsize=1024)
@@ -193,8 +198,8 @@ def _departures(law: PowerLaw, shape: tuple[int, int], period: int, phase: int, 
     covariances = _covariances(law)
     common = covariances[:, np.abs(down * cols + np.arange(1 - cols, cols))] @ pairs / pairs.sum()
     apart = abs(down * cols + right)
-    own = covariances[:, apart] if apart < GRID // 2 else np.zeros(2)
-    return np.asarray(own - common - _column_means(law, shape, period, down, right))
+    covariance = covariances[:, apart] if apart < GRID // 2 else np.zeros(2)
+    return np.asarray(covariance - common - _column_means(law, shape, period, down, right))
 
 
 @lru_cache(maxsize=64)
@@ -204,7 +209,7 @@ def _departures_apart(law: PowerLaw, shape: tuple[int, int], period: int, apart:
             np.mean([_departures(law, shape, period, phase, 0, apart) for phase in range(period)], axis=0)
         )
     right = 2 * np.arange(apart) + 1
-    lost = np.mean([_column_means(law, shape, period, 0, int(one)) for one in right[:: max(apart // 64, 1)]], axis=0)
+    lost = np.mean([_column_means(law, shape, period, 0, int(lag)) for lag in right[:: max(apart // 64, 1)]], axis=0)
     covariances = _covariances(law)
     nearest = _departures(law, shape, period, 0, 0, 1) + _column_means(law, shape, period, 0, 1)
     common = covariances[:, 1] - nearest  # of rows' means in all columns an odd number apart
@@ -230,10 +235,10 @@ def _column_means(law: PowerLaw, shape: tuple[int, int], period: int, down: int,
     use = (k * period) % cols != 0
     turn = np.cos(2.0 * np.pi * k * right / cols) * use
     shown, between = _across_rows(law, shape)
-    found = shown @ turn
+    power = shown @ turn
     if period == 2:  # half a cycle a row lies between two waves
-        found = found + (-1.0) ** down * (between @ turn)
-    return np.asarray(found / (rows * cols))
+        power = power + (-1.0) ** down * (between @ turn)
+    return np.asarray(power / (rows * cols))
 
 
 def _from_whole(cycles: FloatArray) -> FloatArray:
@@ -261,7 +266,7 @@ _kept_row_waves = lru_cache(maxsize=64)(_row_waves)
 
 
 @lru_cache(maxsize=8)
-def _averaged(count: int, law: PowerLaw) -> FloatArray:
+def _average_power(count: int, law: PowerLaw) -> FloatArray:
     """The power law at the frequencies of a line of `count` pixels, of mean 1 over all: that at 0 is the mean within
     half a cycle."""
     power = law.power(np.asarray(fft.rfftfreq(count), float))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -52,25 +53,13 @@ class Trails:
         """Return the number of transfers of lines 0 .. lines - 1, which may lie between two."""
         return np.asarray(line + 1.0 if self.output == "first" else lines - line)
 
-    def steady_share(self, transfers: float) -> float:
-        """Share of even light that is read, far from the first lines: a packet finds what it loses, but for what
-        lies in the trail of the transfers that are still to come, the loss times the mean delay."""
-        lost = 0.0
-        for share, release in self.releases:
-            held = np.exp(-1.0 / release)
-            more = self.loss * share
-            if self.at_once:
-                more /= (1.0 + transfers * self.loss * share / held) ** 2
-            lost += more / (1.0 - held)
-        return 1.0 - lost
-
-    def _kept_at_once(self, transfers: FloatArray | float) -> list[tuple[FloatArray, float]]:
+    def _retain_at_once(self, transfers: FloatArray | float) -> list[tuple[FloatArray, float]]:
         """Return the share of a packet that each species keeps of it, and b, where all transfers act at once."""
-        found = []
+        species = []
         for share, release in self.releases:
             held, lost = float(np.exp(-1.0 / release)), self.loss * share * np.asarray(transfers, float)
-            found.append((np.asarray(lost / (1.0 + lost / held)), held))
-        return found
+            species.append((np.asarray(lost / (1.0 + lost / held)), held))
+        return species
 
     def clock(self, electrons: FloatArray) -> FloatArray:
         """Return the mean electrons (rows, cols) that are read, given those in the pixels.
@@ -84,7 +73,7 @@ class Trails:
         transfers = np.arange(1.0, len(packets) + 1.0)[:, None]
         if self.at_once:
             read = packets
-            for kept, held in self._kept_at_once(transfers):
+            for kept, held in self._retain_at_once(transfers):
                 read = read + _release(kept * packets, held) - kept * packets
             return self._as_given(read)
         lost = self.loss * transfers
@@ -122,7 +111,7 @@ class Trails:
     def _transfer(self, turn: NDArray[np.complex128], transfers: FloatArray | float) -> NDArray[np.complex128]:
         """Return the transfer by the phase of one place back; `turn` and `transfers` broadcast."""
         if self.at_once:
-            parts = [kept * ((1.0 - b) * turn / (1.0 - b * turn) - 1.0) for kept, b in self._kept_at_once(transfers)]
+            parts = [kept * ((1.0 - b) * turn / (1.0 - b * turn) - 1.0) for kept, b in self._retain_at_once(transfers)]
             return np.asarray(1.0 + sum(parts))
         delayed: NDArray[np.complex128] = np.zeros(np.shape(turn), complex)
         for share, release in self.releases:
@@ -145,13 +134,13 @@ class Trails:
         if not to_the_next:
             amplitude = self._transfer(turn, transfers)
         elif self.at_once:
-            kept = sum(kept for kept, _ in self._kept_at_once(transfers))
+            kept = sum(kept for kept, _ in self._retain_at_once(transfers))
             amplitude = (1.0 - kept) / (1.0 - kept * turn)
         else:
             amplitude = np.exp(transfers * self.loss * (turn - 1.0))
         power = np.mean(np.square(np.abs(amplitude)), axis=0)
-        own, first, second = (float(np.mean(power * np.cos(2.0 * np.pi * k * frequency[0]))) for k in range(3))
-        return own, first / own, second / own
+        variance, first, second = (float(np.mean(power * np.cos(2.0 * np.pi * k * frequency[0]))) for k in range(3))
+        return variance, first / variance, second / variance
 
     def kernel(self, transfers: float) -> FloatArray:
         """Return where a packet's charge ends up, (2 `TRAIL_PX` + 1, 1) of rows or (1, 2 `TRAIL_PX` + 1) of columns:
@@ -164,6 +153,17 @@ class Trails:
         if self.output == "last":
             kernel = kernel[::-1]
         return np.asarray(kernel[:, None] if self.axis == 0 else kernel[None, :])
+
+
+@lru_cache(maxsize=256)
+def read_combs(laws: tuple[Trails, ...], lines: int, step: int) -> FloatArray:
+    """Electrons (step, lines) that are read of every line, of one electron in every `step`-th line from the first, the
+    second, ... one on alone: even light of a mosaic, by its phases. `laws`: of one axis, one after the other."""
+    combs = (np.arange(lines) % step == np.arange(step)[:, None]).astype(float)
+    for law in laws:
+        combs = replace(law, axis=1).clock(combs)
+    combs.setflags(write=False)
+    return combs
 
 
 def _release(packets: FloatArray, held: float) -> FloatArray:

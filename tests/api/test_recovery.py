@@ -10,8 +10,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from lab.bench_process import mock_bench
 from lab.capture.store import Store
-from lab.cli.bench_process import mock_bench
 from tests.api.conftest import served, shutter_is_open, until, until_state
 
 

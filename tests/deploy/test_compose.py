@@ -16,7 +16,7 @@ from dask.config import collect_env
 from typer.main import get_command
 
 from lab.capture.settings import Settings
-from lab.cli.entry import app, attach_service_and_mocks
+from lab.cli.entry import add_commands, app
 from lab.jobs import check_scheduler
 
 ROOT = Path(__file__).parents[2]
@@ -51,7 +51,7 @@ def test_it_has_what_a_laboratory_needs() -> None:
 
 @pytest.mark.parametrize("name", ["service", "bench"])
 def test_calibenchs_commands_have_their_options(name: str) -> None:
-    attach_service_and_mocks()
+    add_commands()
     program, command, *arguments = shlex.split(SERVICES[name]["command"])
     assert program == "calibench"
     context = get_command(app).make_context("calibench", [command], resilient_parsing=True)

@@ -14,7 +14,7 @@ from seabreeze.pyseabreeze.transport import USBTransport
 from typer.main import get_command
 
 from drivers.monochromator.cornerstone260b import MODELS, VENDOR
-from lab.cli.entry import app, attach_service_and_mocks
+from lab.cli.entry import add_commands, app
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
@@ -75,7 +75,7 @@ def test_the_service_may_do_little(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", [name for name in UNITS if name.endswith(".service")])
 def test_the_commands_of_the_units_are_calibenchs(name: str) -> None:
     """Program, command and every option exist."""
-    attach_service_and_mocks()
+    add_commands()
     (line,) = unit(name)["Service"]["ExecStart"]
     program, command, *arguments = line.split()
     assert program == "/opt/calibench/bin/calibench"

@@ -51,7 +51,7 @@ def test_it_runs_away_from_the_checkout(wheel: Path, tmp_path: Path) -> None:
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
     paths = [str(tmp_path / "installed"), sysconfig.get_path("purelib")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-    command = [sys.executable, "-m", "lab.cli", "capture", "--quick", "--only", "dark", "--out", "data"]
+    command = [sys.executable, "-m", "calibench", "capture", "--quick", "--only", "dark", "--out", "data"]
     code = "import calibench, api, drivers, lab, mocks, sim; print(calibench.__file__, lab.__file__, sim.__file__)"
     where = [sys.executable, "-c", code]
     found = subprocess.run(where, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout

@@ -68,6 +68,13 @@ def probability(case: CaseStatements, kind: str, name: str) -> float:
     return next(s.probability for s in case.statements if (s.kind, s.name) == (kind, name))
 
 
+def test_a_wrong_statement_counts_as_wrong_metadata() -> None:
+    """It is no effect of the library: of its family alone is anything said."""
+    case = case_statements("case", truth(), run({"wrong_exposure": 0.3}))
+    assert probability(case, "family", "wrong_metadata") == 0.3
+    assert all(s.probability == 0.0 for s in case.statements if s.kind == "effect")
+
+
 def test_scores_of_a_single_effect() -> None:
     """0.8 for the one that acts and its family, 0.1 for one of another family and that family, 0 for all others."""
     case = case_statements("case", truth("defocus"), run({"defocus": 0.8, "crosstalk": 0.1}))

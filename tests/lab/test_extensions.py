@@ -48,6 +48,7 @@ OTHERS = """
 from dataclasses import replace
 
 import numpy as np
+import typer
 
 from lab.formats.importers import Importer
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
@@ -65,6 +66,12 @@ def read(path, options):
 
 
 FORMAT = Importer(read)
+COMMANDS = typer.Typer()
+
+
+@COMMANDS.command()
+def greet() -> None:
+    print("good morning")
 """
 POINTS = """[calibench.effects]
 hum_of_ours = extension_of_ours:HumOfOurs
@@ -83,6 +90,9 @@ no-lamp = others_of_ours:read
 dark = others_of_ours:LAMP
 [calibench.capture_kinds]
 nothing = others_of_ours:LAMP
+[calibench.commands]
+ours = others_of_ours:COMMANDS
+no-commands = others_of_ours:LAMP
 """
 
 
@@ -108,7 +118,7 @@ def run(environment: dict[str, str], *arguments: str, cwd: Path | None = None) -
 
 
 def test_an_effect_of_another_package_is_listed_and_broken_ones_are_a_line_each(environment: dict[str, str]) -> None:
-    done = run(environment, "-m", "lab.cli", "effects", "list", "hum_of_ours")
+    done = run(environment, "-m", "calibench", "effects", "list", "hum_of_ours")
     assert done.returncode == 0 and "Each row is read with the mains' hum." in done.stdout, done.stderr
     for name, why in (
         ("not_there", "can't be loaded (AttributeError"),
@@ -120,6 +130,12 @@ def test_an_effect_of_another_package_is_listed_and_broken_ones_are_a_line_each(
                    and not one.startswith("calibench: warning")}  # fmt: skip
         assert line.endswith("it is left out: mend its package, or remove it")
     assert "Traceback" not in done.stderr
+
+
+def test_a_command_of_another_package_runs_and_what_is_none_is_a_line(environment: dict[str, str]) -> None:
+    done = run(environment, "-m", "calibench", "greet")
+    assert (done.returncode, done.stdout) == (0, "good morning\n"), done.stderr
+    assert "calibench.commands: no-commands: " in done.stderr and "is no typer.Typer; it is left out" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -135,7 +151,7 @@ def test_an_effect_of_another_package_is_listed_and_broken_ones_are_a_line_each(
 def test_the_contract_runs_on_a_package_by_its_name(
     package: str, code: int, said: str, environment: dict[str, str]
 ) -> None:
-    done = run(environment, "-m", "lab.cli", "check-effect", package)
+    done = run(environment, "-m", "calibench", "check-effect", package)
     assert done.returncode == code and said in done.stdout + done.stderr, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
 
@@ -177,7 +193,7 @@ def test_a_drafted_package_keeps_the_contract_where_it_is_installed(
     (place / "METADATA").write_text("Metadata-Version: 2.1\nName: calibench-effect-eighth-row\nVersion: 0.1.0\n")
     (place / "entry_points.txt").write_text("[calibench.effects]\neighth_row = eighth_row:EighthRow\n")
     there = environment | {"PYTHONPATH": os.pathsep.join([str(folder), str(Path(__file__).parents[2])])}
-    done = run(there, "-m", "lab.cli", "check-effect", "calibench-effect-eighth-row")
+    done = run(there, "-m", "calibench", "check-effect", "calibench-effect-eighth-row")
     assert done.returncode == 0 and "eighth_row: keeps the contract of effects" in done.stdout, (
         done.stdout + done.stderr
     )

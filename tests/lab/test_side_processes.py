@@ -124,7 +124,7 @@ def test_a_process_that_was_ended_carries_nothing_out() -> None:
 def test_ctrl_c_ends_cleanly(tmp_path: Path) -> None:
     """One line, exit code 130, and no process is left."""
     write(_darks(), tmp_path / "set")
-    line = [sys.executable, "-m", "lab.cli", "diagnose", str(tmp_path / "set")]
+    line = [sys.executable, "-m", "calibench", "diagnose", str(tmp_path / "set")]
     process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     # one is enough: on a busy machine the first may be done before the second begins
     while not (begun := _children(process.pid)) and process.poll() is None:

@@ -1,7 +1,7 @@
 """Every effect of the library is concealed on the bench, and the bench's frames are those that the forward model
 predicts.
 
-Predictions start from the scene and the radiometer's readings and use `sim.frame.expected_sequence`; the bench exposes
+Predictions start from the scene and the radiometer's readings and use `sim.frame.expect_sequence`; the bench exposes
 frame by frame, with its own settings, clock and temperature.
 """
 
@@ -28,7 +28,7 @@ from mocks.truth import HiddenCamera, hidden_truth
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.library import effects as library
-from sim.frame import Exposure, dark_electrons, expected_sequence, read_out
+from sim.frame import Exposure, dark_electrons, expect_sequence, read_out
 from sim.scene import Darkness, Scene, ScreenPattern, UniformField
 from sim.sensor.electrons import dn_moments
 from sim.spectrum import FloatArray, Spectrum
@@ -71,6 +71,7 @@ class Case:
 
 CASES = (
     Case("left:adc_nonlinearity:error_dn=40", (replace(FLAT, exposure_s=0.004),)),
+    Case("left:alternating_row_noise:noise_e=6", (DARK,), tolerance=0.4),
     Case("both:ambient_light:rate_e_per_s=100000,red_over_blue=3", (FLAT, replace(FLAT, light=LightSettings()))),
     Case("left:amplifier_crosstalk:share_percent=4,excess_percent=3,pedestal_e=200", (FLAT, DARK)),
     Case("left:amplifier_glow:glow_e_per_s=300,reach_mm=0.2,corner=bottom_left", (DARK,)),
@@ -196,7 +197,7 @@ def predicted(
     found = []
     model = camera.model
     fine = any(isinstance(exposure.scene, ScreenPattern) for exposure in exposures)
-    means = expected_sequence(
+    means = expect_sequence(
         model,
         exposures,
         effects,

@@ -26,7 +26,7 @@ def _result(folder: Path, kind: str) -> dict[str, Any]:
 
 @pytest.mark.timeout(900)
 def test_the_main_job_recovers_what_the_bench_conceals(tmp_path: Path, subtests: pytest.Subtests) -> None:
-    command = [sys.executable, "-m", "lab.cli", "run", "--quick", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "calibench", "run", "--quick", "--out", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=850, check=False)
     assert done.returncode == 0, done.stderr
     (folder,) = (tmp_path / "sessions").iterdir()

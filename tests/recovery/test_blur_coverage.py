@@ -1,6 +1,6 @@
 """Are the uncertainties of edges and kernels true? Draws of known truths: shares within two standard uncertainties.
 
-Prints the coverage tables of docs/explanation/accuracy.md, "MTF" and "PSF".
+Prints the coverage tables of docs/explanation/accuracy/blur.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Are the noise figures' stated uncertainties true? Every figure over many draws of cameras with known truth.
 
-`pytest -m slow -s tests/recovery/test_noise_coverage.py` prints the table that stands in docs/explanation/accuracy.md.
+`pytest -m slow -s tests/recovery/test_noise_coverage.py` prints the table of
+docs/explanation/accuracy/noise.md.
 """
 
 from __future__ import annotations

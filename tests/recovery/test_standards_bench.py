@@ -23,7 +23,7 @@ SIDES = ("left", "right")
 
 @pytest.mark.timeout(600)
 def test_one_session_gives_every_standard(tmp_path: Path, subtests: pytest.Subtests) -> None:
-    command = [sys.executable, "-m", "lab.cli", "run", "--standards", "--quick", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "calibench", "run", "--standards", "--quick", "--out", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=550, check=False)
     assert done.returncode == 0, done.stderr
     (folder,) = (tmp_path / "sessions").iterdir()

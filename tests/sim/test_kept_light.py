@@ -16,9 +16,9 @@ from sim.frame import (
     EMPTY,
     Exposure,
     KeptTransfers,
-    collected_electrons,
+    collect_electrons,
+    expect_sequence,
     expected_electrons,
-    expected_sequence,
     pair_gain_factor,
     read_electrons,
     scene_light,
@@ -38,7 +38,7 @@ def test_one_light_serves_many_exposures(colour_camera: CameraModel, lamp: Spect
     for exposure_s, elapsed_s in ((0.01, 0.0), (0.02, 120.0)):
         exposure = Exposure(UniformField(lamp), exposure_s, elapsed_s=elapsed_s)
         assert np.array_equal(
-            collected_electrons(light, colour_camera, exposure, effects),
+            collect_electrons(light, colour_camera, exposure, effects),
             expected_electrons(colour_camera, exposure, effects),
         )
 
@@ -48,7 +48,7 @@ def test_ambient_light_stays_when_the_source_changes(colour_camera: CameraModel,
     light = scene_light(colour_camera, UniformField(lamp), effects)
     exposure = Exposure(UniformField(lamp), 0.01)
     full, half, none = (
-        collected_electrons(light, colour_camera, exposure, effects, source=source) for source in (1.0, 0.5, 0.0)
+        collect_electrons(light, colour_camera, exposure, effects, source=source) for source in (1.0, 0.5, 0.0)
     )
     assert np.allclose(half - none, 0.5 * (full - none))
     assert np.allclose(none, 5.0 + colour_camera.dark_current_e_per_s * 0.01)
@@ -84,7 +84,7 @@ def test_read_and_lagging_charge_add_up_to_the_charge_held(colour_camera: Camera
     effects = (ImageLag(lag_percent=4.0),)
     exposures = [Exposure(UniformField(lamp), 0.01), Exposure(Darkness(), 0.01)]
     kept = EMPTY
-    for exposure, together in zip(exposures, expected_sequence(colour_camera, exposures, effects), strict=True):
+    for exposure, together in zip(exposures, expect_sequence(colour_camera, exposures, effects), strict=True):
         new, before = expected_electrons(colour_camera, exposure, effects), kept
         read, kept = read_electrons(new, colour_camera, exposure, effects, before)
         assert np.allclose(read, together)

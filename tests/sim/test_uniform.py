@@ -12,6 +12,9 @@ from sim.detection import responsivity
 from sim.effects import library
 from sim.effects.ambient_light import AmbientLight
 from sim.effects.base import Effect
+from sim.effects.brighter_fatter import BrighterFatter
+from sim.effects.charge_transfer_inefficiency import ChargeTransferInefficiency
+from sim.effects.crosstalk import Crosstalk
 from sim.effects.exposure_offset import ExposureOffset
 from sim.frame import Exposure, predict_frame
 from sim.optics.illumination import irradiance_factor
@@ -22,9 +25,9 @@ from sim.scene import (
     UniformField,
 )
 from sim.sensor import mosaic
-from sim.spectrum import Spectrum, photons_from_energy
-from sim.stages import Light
-from sim.uniform import FieldPoints, Uniform, electron_rate
+from sim.spectrum import FloatArray, Spectrum, photons_from_energy
+from sim.stages import Light, charge_of
+from sim.uniform import LEAST_UNMIXED, FieldPoints, Uniform, electron_rate
 from tests.sim.local_effects import AngleCut, Local, ReadOutRamp
 
 
@@ -150,3 +153,50 @@ def test_light_of_the_room_is_collected_while_the_shutter_is_open(colour_camera:
     assert wanted == pytest.approx(camera.conversion_gain_dn_per_e * 5e4 * 0.012)
     row, col = mosaic.phases(camera.cfa)["G"][0]
     assert frame[row::2, col::2].mean() == pytest.approx(wanted, rel=1e-3)
+
+
+# --- Charge between neighbours in even light --------------------------------------------------------------------------
+
+TRAILS = ChargeTransferInefficiency(
+    parallel_ppm=900.0, release_px=1.2, serial_ppm=400.0, serial_release_px=3.0, first_column="right"
+)
+LEVELS = {"R": 4000.0, "G": 2500.0, "B": 300.0}
+
+
+def even_frame(camera: CameraModel) -> FloatArray:
+    shape = camera.rows, camera.cols
+    return mosaic.assemble({c: np.full(shape, e) for c, e in LEVELS.items()}, camera.cfa)
+
+
+def test_combs_read_the_frame_of_even_light(colour_camera: CameraModel) -> None:
+    """The trails of rows and of columns act along one axis each: the frame that is read is their product."""
+    model = Uniform(colour_camera, (TRAILS,))
+    down, across = model.read_combs()
+    wanted = charge_of(colour_camera, (TRAILS,)).clock_out(even_frame(colour_camera))
+    np.testing.assert_allclose(down.T @ model.phases_of(LEVELS) @ across, wanted, rtol=1e-9)
+
+
+@pytest.mark.parametrize("effects", [(TRAILS,), (TRAILS, Crosstalk(share_percent=1.0))])
+def test_mixing_is_the_mean_over_the_frame_or_that_of_a_place(
+    colour_camera: CameraModel, effects: tuple[Effect, ...]
+) -> None:
+    """The frame's mean, and the pixels of one period of the mosaic where a place lies."""
+    charge = charge_of(colour_camera, effects)
+    read = charge.clock_out(charge.move_charge(even_frame(colour_camera)))
+    model = Uniform(colour_camera, effects)
+    for place, part in ((None, read), ((60.4, 20.3), read[60:62, 20:22])):
+        factors = model.mixing_factors(LEVELS, place)
+        planes = mosaic.planes(part, colour_camera.cfa)
+        means = {c: np.mean([plane.mean() for n, plane in planes.items() if n[0] == c]) for c in LEVELS}
+        assert factors == pytest.approx({c: means[c] / LEVELS[c] for c in LEVELS}, rel=1e-9)
+
+
+@pytest.mark.parametrize("more", [Crosstalk(share_percent=1.0), BrighterFatter(exchanged_percent=3.0)])
+def test_the_light_of_a_signal_is_the_inverse_of_mixing(colour_camera: CameraModel, more: Effect) -> None:
+    """To the share of the brightest channel at which the search for it stops, where charge is exchanged by how much
+    neighbours hold."""
+    model = Uniform(colour_camera, (TRAILS, more))
+    read = {c: LEVELS[c] * factor for c, factor in model.mixing_factors(LEVELS).items()}
+    assert abs(read["B"] / LEVELS["B"] - 1.0) > 0.1
+    assert model.light_of(read) == pytest.approx(LEVELS, abs=2.0 * LEAST_UNMIXED * LEVELS["R"])
+    assert Uniform(colour_camera).light_of(read) == read

@@ -26,8 +26,8 @@ from api.client import ServiceClient, ServiceProblem
 from api.keys import Permission, create_key
 from api.safety import StationSafety
 from api.schemas import Halted, SessionStart
+from lab.bench_process import mock_bench
 from lab.capture.store import Store
-from lab.cli.bench_process import mock_bench
 from tests.api.conftest import served, shutter_is_open
 
 HALTS = int(os.environ.get("HALTS", "20"))

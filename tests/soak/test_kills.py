@@ -24,8 +24,8 @@ from distributed import LocalCluster
 from api.client import ServiceClient
 from api.keys import Permission, create_key
 from api.schemas import SessionStart
+from lab.bench_process import mock_bench
 from lab.capture.store import Store
-from lab.cli.bench_process import mock_bench
 from tests.api.conftest import served, shutter_is_open
 
 KILLS = int(os.environ.get("KILLS", "20"))

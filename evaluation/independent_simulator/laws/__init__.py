@@ -66,6 +66,7 @@ from evaluation.independent_simulator.laws.imaging import (
 )
 from evaluation.independent_simulator.laws.readout import (
     AdcNonlinearityLaw,
+    AlternatingRowNoiseLaw,
     AmplifierCrosstalkLaw,
     BitWeightsLaw,
     BlackLevelDriftLaw,
@@ -149,6 +150,7 @@ LISTED: tuple[type[Law], ...] = (
     SourceInstabilityLaw,
     BitWeightsLaw,
     ResponseKneeLaw,
+    AlternatingRowNoiseLaw,
     ColouredLineNoiseLaw,
     PhaseDetectionRowsLaw,
     TapGainLaw,

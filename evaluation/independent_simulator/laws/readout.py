@@ -255,6 +255,20 @@ class RowNoiseLaw(Law):
         return {"noise_e": self.strength}
 
 
+class AlternatingRowNoiseLaw(Law):
+    """Two amplifiers, of even and of odd columns, are clamped anew before every row, each at a level of its own."""
+
+    name = effect = "alternating_row_noise"
+    unit, nominal, limits, power, shown_by = "e", 1.5, (0.1, 30.0), 2.0, DARK
+
+    def noise_e(self, shape: tuple[int, int], k: int) -> Array:
+        level = self.rng(23, k).standard_normal((2, shape[0], 1))
+        return self.strength * np.where(np.arange(shape[1]) % 2 == 0, level[0], level[1])
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"noise_e": self.strength}
+
+
 class ColouredLineNoiseLaw(Law):
     """Noise of lines by fluctuators of many time constants, the sum of which has a spectrum of about 1/f (Machlup
     1954). Variants: rows; columns; rows, the slow fluctuators twice as strong in power (steeper)."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lab.diagnose.evidence.side_table import SideTable
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.outcome.next_capture import NOTHING, WITH
+from lab.inference.hypotheses import Coordinate
 from lab.inference.posterior import NAMED, Size, parameter_draws, parameter_slice, sizes_of, weights_of_sets
 from lab.inference.search import FittedSet, Table
 from sim.effects.base import Effect
@@ -34,7 +35,8 @@ class Cause:
     """An effect, or a family of which no member is named, with its inclusion probability on one side.
 
     `effect`: the law whose parameters these are, at the mode of its likeliest set. `prior`: inclusion probability
-    before the recordings. `mean` (p,), `covariance` (p, p): of its parameters u, over the mixture. `members`: of a
+    before the recordings. `mean` (p,), `covariance` (p, p): of its parameters u, over the mixture; `coordinates`: these
+    with their priors. `members`: of a
     family, with their inclusion probabilities, likeliest first. `rivals`: what stands in its place in the sets without
     it, with their probabilities. `inexact`: probability that its law's error is above the declared tolerance, or that
     unlisted physics acts where it does, given the name. `alike`: the effect by other choices that remain probable."""
@@ -53,7 +55,7 @@ class Cause:
     modes: tuple[dict[str, float], ...] = ()
     alike: tuple[Effect, ...] = ()
     shown_in: tuple[str, ...] = ()
-    log_prior_density: float = field(default=0.0)
+    coordinates: tuple[Coordinate, ...] = ()
 
     @property
     def kind(self) -> type[Effect]:
@@ -70,26 +72,22 @@ def causes_of(reading: SideTable) -> tuple[Cause, ...]:
     """Return the effects that may be named, and the families of which no member is, likeliest first."""
     found = []
     posterior = reading.posterior
-    named_families = {library_family(f.name) for f in posterior.named if f.kind == "effect"}
+    named_families = {reading.family_of(f.name) for f in posterior.named if f.kind == "effect"}
     for finding in posterior.findings:
-        if finding.probability < LEAST_DESCRIBED:
+        if finding.probability < LEAST_DESCRIBED or finding.name in reading.statements:
             continue
         if finding.kind == "effect":
             members: tuple[tuple[str, float], ...] = ()
             law = finding.name
         elif finding.kind == "family" and finding.probability >= NAMED and finding.name not in named_families:
             members = members_of(reading, finding.name)
-            law = next((name for name, _ in members if weights_of_sets(reading.table, name)), "")
+            of_effects = (name for name, _ in members if name not in reading.statements)
+            law = next((name for name in of_effects if weights_of_sets(reading.table, name)), "")
         else:
             continue
         if law and weights_of_sets(reading.table, law):
             found.append(_cause(reading, finding.name, law, finding.probability, members))
     return tuple(found)
-
-
-def library_family(name: str) -> str:
-    """Return the family's identifier of an effect."""
-    return library()[name].family.value
 
 
 def members_of(reading: SideTable, family: str) -> tuple[tuple[str, float], ...]:
@@ -111,7 +109,7 @@ def _cause(
     effect = next(e for e in reading.effects_of(best.state) if e.name == law)
     draws = parameter_draws(table, law)
     names = {f.name for f in reading.posterior.findings if f.kind == "effect"}
-    alternatives = frozenset(n for n in names if library_family(n) == name) if members else frozenset((law,))
+    alternatives = frozenset(n for n in names if reading.family_of(n) == name) if members else frozenset((law,))
     prior = sum(reading.inclusion_prior[n] for n in alternatives)
     mean = draws.mean(axis=0)
     return Cause(
@@ -136,9 +134,8 @@ def _cause(
         modes=tuple(_modes(reading, law, best, draws)),
         alike=tuple(_other_choices(reading, weights, effect)),
         shown_in=shown_in(reading.used, effect, reading.effects_of(best.state)),
-        log_prior_density=float(
-            sum(c.log_prior(u) for c, u in zip(hypothesis.coordinates, mean, strict=True) if not c.is_shape)
-        ),
+        # without their conversions, which can't be sent between processes
+        coordinates=tuple(replace(c, to_value=None) for c in hypothesis.coordinates),
     )
 
 
@@ -166,6 +163,8 @@ def _inexact(reading: SideTable, names: frozenset[str]) -> float:
 
 def _shared_groups(reading: SideTable, name: str) -> frozenset[int]:
     """Return the groups of small physics most of whose change lies in the measurements that an effect changes."""
+    if name in reading.statements:
+        return frozenset()
     kind = library()[name]
     model = reading.used
     touched = np.concatenate([np.full(len(b.value), b.touched_by(kind)) for b in model.blocks])
@@ -188,7 +187,7 @@ def _rivals(reading: SideTable, names: frozenset[str]) -> tuple[tuple[str, float
         if row.members & names:
             continue
         instead = sorted(row.members - best)
-        unlisted = [f"unlisted physics of the {table.groups[g]}" for g in sorted(row.unlisted)]
+        unlisted = [f"unlisted physics of the {state}" for state in table.states(row.unlisted)]
         name = WITH.join(instead or unlisted) or NOTHING
         found[name] = found.get(name, 0.0) + row.probability
     listed = sorted(found.items(), key=lambda item: -item[1])

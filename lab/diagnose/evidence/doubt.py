@@ -50,6 +50,8 @@ def _rivals(reading: SideTable) -> Iterator[tuple[FittedSet, float]]:
         if probability < LEAST or held > SHARE:
             return
         held += probability
+        if members & reading.statements:  # no other capture is predicted by what is stated of these
+            continue
         fit = reading.fit_of(members)
         if fit is not None:
             yield fit, probability

@@ -9,16 +9,16 @@ import numpy as np
 
 from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.evidence.causes import Cause
+from lab.diagnose.evidence.laws import Law
 from lab.diagnose.evidence.side_table import SideTable, posterior_means, weighted_residual
 from lab.diagnose.outcome.corrections import (
-    Applied,
     Correction,
     correction_on,
     factor_along,
-    multiplied_curve,
     nearest_form,
     place_for,
     scaled_curve,
+    with_laws,
 )
 from lab.diagnose.outcome.model_posterior import lasting_means_of, model_posterior
 from lab.diagnose.outcome.next_capture import NOTHING, WITH
@@ -26,23 +26,16 @@ from lab.formats.camera_file import CameraFile
 from lab.formats.camera_model import camera_model, remarks_on_values
 from lab.formats.model_posterior import NameInDoubt, RivalModel, StoredEffect
 from lab.formats.results import FitResult
-from lab.formats.results.diagnosis import IN_CURVES
 from lab.inference.model import scaled_columns
-from lab.inference.posterior import LIKELIER
 from lab.inference.search import FittedSet
 from lab.observables.flats.stated_light import most_frequent_gain_db
 from lab.observables.spectra.curves import freed_curve
+from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.spectrum import FloatArray
 
-#: Groups of small physics that a factor on a stage of the camera can stand for.
-STAGES: dict[str, Applied] = {
-    "transfer": "transfer",
-    "field": "illumination",
-    "spectral": "sensitivity",
-    "response": "response",
-    "shot noise": "noise",
-}
+#: The group whose law is a factor on the noise: it holds what the fit moved the gain by, too, as the camera keeps its.
+SHOT_NOISE = "shot noise"
 #: Least probability of a rival that a prediction is made for, and the most of them.
 LEAST_RIVAL, MOST_RIVALS = 0.005, 4
 
@@ -59,21 +52,23 @@ class Improved:
     corrections: tuple[Correction, ...]
 
 
-def improve(reading: SideTable, fit: FitResult | None, baseline: CameraFile | None, named: Sequence[Cause]) -> Improved:
+def improve(
+    reading: SideTable,
+    fit: FitResult | None,
+    baseline: CameraFile | None,
+    named: Sequence[Cause],
+    without_name: Sequence[Law] = (),
+) -> Improved:
     """Return the camera with the named effects, and a family's likeliest law, at the mode of their set; its sensitivity
-    curves at the posterior mean of their nuisance parameters; and a factor for each unlisted group that a stage can
-    hold. Noise and levels are the fit's where there is one; `fit` is of the used captures."""
+    curves at the posterior mean of their nuisance parameters; and the laws without a name that a state of the camera
+    has. Noise and levels are the fit's where there is one; `fit` is of the used captures."""
     laws = frozenset(cause.effect.name for cause in named)
     found = reading.fit_of(laws) or _likeliest_with(reading, laws)
     effects = tuple(e for e in reading.effects_of(found.state) if e.name in laws)
-    unlisted = frozenset(
-        reading.table.groups.index(f.name)
-        for f in reading.posterior.findings
-        if f.kind == "unlisted" and f.probability >= LIKELIER
-    )
+    unlisted = frozenset(law.group for law in without_name)
     tau = found.likeliest.scales.mode(unlisted)
     disturbances = scaled_columns(reading.problem.groups, tau, len(reading.used.value))
-    camera, corrections = _camera(reading, fit, baseline, effects, unlisted, disturbances)
+    camera, corrections = _camera(reading, fit, baseline, effects, disturbances, without_name)
     gain_db = most_frequent_gain_db(reading.recordings.captures(FlatCapture, reading.side))
     is_corrected = any(one.kind == "noise" for one in corrections)
     posterior = model_posterior(
@@ -90,8 +85,8 @@ def _camera(
     fit: FitResult | None,
     baseline: CameraFile | None,
     effects: tuple[Effect, ...],
-    unlisted: frozenset[int],
     disturbances: FloatArray,
+    without_name: Sequence[Law],
 ) -> tuple[CameraFile, tuple[Correction, ...]]:
     """Return the camera with these effects and its corrections, and these in words."""
     side, model = reading.side, reading.used
@@ -111,36 +106,20 @@ def _camera(
     always = baseline.effects if baseline is not None else ()
     acting: list[Effect] = [*always, *(nearest_form(e, estimates) for e in effects)]
     corrections: list[Correction] = []
-    by_group = _changes(reading, effects, disturbances)
-    jacobian = model.nuisance_jacobian(effects)
-    moved = sum((estimates[n] * c for n, c in jacobian.items()), np.zeros(len(model.value)))
-    stated = model.mean(effects)
-    for g in sorted(unlisted):
-        name = reading.problem.groups[g].name
-        kind = STAGES.get(name)
-        index = None if kind is None else _block_of(reading, by_group[g], kind)
-        if kind is None or index is None:
-            said = f"{name}: no correction in the improved model; it has no place for one there"
-            corrections.append(Correction(name, None, said))
-            continue
-        block, at = model.blocks[index], model.slices[index]
-        if kind == "noise":  # the camera keeps its gain: the correction holds what the fit moved that by, too
-            x, factor, each = factor_along(block, (moved + change)[at], stated[at])
-        else:
-            x, factor, each = factor_along(block, by_group[g][at], (stated + moved)[at])
-        if kind == "sensitivity":
-            for channel in each.keys() & curves.keys():
-                curves[channel] = multiplied_curve(curves[channel], *each[channel])
-            said = f"{name}: {IN_CURVES}, by wavelength and channel"
-        else:
-            acting.append(correction_on(kind, block, x, factor, camera))
-            said = f"{name}: a factor on the {kind}"
-        corrections.append(Correction(name, kind, said))
+    laws: list[Effect] = []
+    for name in dict.fromkeys(law.told.state for law in without_name):
+        mine = [law for law in without_name if law.told.state == name]
+        factor = _noise_factor(reading, effects, estimates, change, camera) if name == SHOT_NOISE else None
+        own = [law.effect for law in mine if law.effect is not None] if factor is None else [factor]
+        laws += own
+        indices = " and ".join(dict.fromkeys(law.told.along for law in mine if law.effect is not None))
+        said = f"a law by {indices}" if own else "no correction in the improved model; it has no place for one there"
+        corrections.append(Correction(name, None if factor is None else "noise", f"{name}: {said}"))
     unknown = "" if model.gain_is_known else ", conversion gain unknown: electrons of 1 DN/e are DN"
     title = f"{reading.recordings.manifest.name} {side}{unknown}".strip()
     remarks = () if taken else remarks_on_values(reading.recordings.camera(side), of_side, camera)
     improved = camera.model_copy(update={"quantum_efficiency": curves})
-    return CameraFile(title, improved, tuple(acting), remarks=remarks), tuple(corrections)
+    return with_laws(CameraFile(title, improved, tuple(acting), remarks=remarks), laws), tuple(corrections)
 
 
 def _likeliest_with(reading: SideTable, laws: frozenset[str]) -> FittedSet:
@@ -149,26 +128,29 @@ def _likeliest_with(reading: SideTable, laws: frozenset[str]) -> FittedSet:
     return reading.table.fits[rows[0].members if rows else frozenset[str]()]
 
 
-def _changes(reading: SideTable, effects: tuple[Effect, ...], disturbances: FloatArray) -> list[FloatArray]:
-    """Return the posterior mean change (n,) of the used numbers by each group of small physics."""
-    weighted = weighted_residual(reading.used, effects, disturbances)
-    ends = np.cumsum([g.columns.shape[1] for g in reading.problem.groups])
-    found = []
-    for group, end in zip(reading.problem.groups, ends, strict=True):
-        own = disturbances[:, end - group.columns.shape[1] : end]
-        found.append(own @ (own.T @ weighted))
-    return found
-
-
-def _block_of(reading: SideTable, change: FloatArray, kind: Applied) -> int | None:
-    """Return the block along whose axis a factor on a stage can act, the one that a change shows most in."""
+def _noise_factor(
+    reading: SideTable,
+    effects: tuple[Effect, ...],
+    estimates: Mapping[str, float],
+    change: FloatArray,
+    camera: CameraModel,
+) -> Effect | None:
+    """Return the factor on the noise of flats by level; None where no flats show it. The camera keeps its gain: the
+    factor holds what the fit moved that by, too."""
     model = reading.used
     size = {
         k: float(np.sum(np.square(change[at]) / np.diag(block.covariance)))
         for k, (block, at) in enumerate(zip(model.blocks, model.slices, strict=True))
-        if place_for(block) == kind
+        if place_for(block) == "noise"
     }
-    return max(size, key=lambda k: size[k], default=None)
+    if not size:
+        return None
+    index = max(size, key=lambda k: size[k])
+    block, at = model.blocks[index], model.slices[index]
+    jacobian = model.nuisance_jacobian(effects)
+    moved = sum((estimates[n] * c for n, c in jacobian.items()), np.zeros(len(model.value)))
+    x, factor, _ = factor_along(block, (moved + change)[at], model.mean(effects)[at])
+    return correction_on("noise", block, x, factor, camera)
 
 
 def _in_doubt(reading: SideTable, effects: tuple[Effect, ...], disturbances: FloatArray, cause: Cause) -> NameInDoubt:

@@ -162,16 +162,17 @@ class _UnlistedChange:
     after: Gaussian
 
 
-def _unlisted_change(reading: SideTable, group: int) -> _UnlistedChange | None:
-    rows = [r for r in reading.table.rows if group in r.unlisted and r.refitted]
-    if not rows:
+def _unlisted_change(reading: SideTable, state: str) -> _UnlistedChange | None:
+    groups = reading.table.groups_on(state)
+    row = max(
+        (r for r in reading.table.rows if groups & r.unlisted and r.refitted), key=lambda r: r.probability, default=None
+    )
+    if row is None:
         return None
-    row = max(rows, key=lambda r: r.probability)
     fit = reading.table.fits[row.members]
-    before = reading.gaussian(fit, row.unlisted - {group})
-    after = reading.gaussian(fit, row.unlisted)
-    tau = fit.likeliest.scales.mode(row.unlisted)[group]
-    columns = tau * reading.problem.groups[group].columns
+    before, after = (reading.gaussian(fit, unlisted) for unlisted in (row.unlisted - groups, row.unlisted))
+    tau = fit.likeliest.scales.mode(row.unlisted)
+    columns = np.column_stack([tau[g] * reading.problem.groups[g].columns for g in groups & row.unlisted])
     change = columns @ (columns.T @ after.solve(reading.used.value - after.mean))
     return _UnlistedChange(change, before, after)
 
@@ -183,8 +184,7 @@ def unlisted_of(reading: SideTable) -> tuple[list[Unlisted], list[Unexplained]]:
     for finding in reading.posterior.findings:
         if finding.kind != "unlisted" or finding.probability < LEAST_UNLISTED:
             continue
-        group = reading.table.groups.index(finding.name)
-        departure = _unlisted_change(reading, group)
+        departure = _unlisted_change(reading, finding.name)
         blocks = [] if departure is None else _changed(reading.used, departure.change)
         where = "" if departure is None or not blocks else _range(reading.used, blocks[0], departure.change)
         listed.append(
@@ -194,7 +194,7 @@ def unlisted_of(reading: SideTable) -> tuple[list[Unlisted], list[Unexplained]]:
             )
         )  # fmt: skip
         if finding.probability >= LIKELIER and departure is not None and blocks:
-            left.append(_without_name(reading, group, finding.probability, departure, blocks[0], where))
+            left.append(_without_name(reading, finding.name, finding.probability, departure, blocks[0], where))
     return listed, left
 
 
@@ -223,9 +223,8 @@ def _range(model: MeasurementModel, index: int, change: FloatArray) -> str:
 
 
 def _without_name(
-    reading: SideTable, group: int, probability: float, departure: _UnlistedChange, index: int, where: str
+    reading: SideTable, state: str, probability: float, departure: _UnlistedChange, index: int, where: str
 ) -> Unexplained:
-    declared = reading.problem.groups[group]
     block, at = reading.used.blocks[index], reading.used.slices[index]
     of = np.arange(at.start, at.stop)
     residual = reading.used.value
@@ -235,7 +234,7 @@ def _without_name(
     parts = [s for s in examine_places(reading.used, departure.before) if s.block is block]
     return Unexplained(
         side=reading.side, measurement=block.measurement.name, axis=block.measurement.axis, where=where,
-        shape=f"unlisted physics acts on the {declared.name}, with probability {probability:.3f}",
+        shape=f"unlisted physics acts on the {state}, with probability {probability:.3f}",
         significance_sigma=round(parts[0].significance_sigma, 2), chi2_before=before, chi2_after=after, n=len(of),
         captures=_captures(block),
     )  # fmt: skip
@@ -321,6 +320,7 @@ def residual_curves(reading: SideTable, fit: FittedSet, unlisted: frozenset[int]
     columns = [
         t * np.vstack([g.columns, g.held_out if g.held_out is not None else none.reshape(0, g.columns.shape[1])])
         for g, t in zip(reading.problem.groups, tau, strict=True)
+        if t > 0.0
     ]
     disturbances = np.column_stack([np.zeros((len(model.value), 0)), *columns])
     estimates, change = posterior_means(model, effects, disturbances)
@@ -365,6 +365,8 @@ def detectability(reading: SideTable) -> Iterator[Visibility]:
     columns: dict[str, list[tuple[tuple[Effect, ...], FloatArray]]] = {}
     scale: dict[str, float] = {}
     for name, hypothesis in reading.search.hypotheses.items():
+        if name in reading.statements:  # a wrong statement has no size from which on it would show
+            continue
         for alternative in hypothesis.alternatives:
             effects = tuple(point.template for point in alternative.points)
             white = reading.baseline.whiten(np.column_stack([model.mean((e,)) - base for e in effects]))

@@ -10,9 +10,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lab.capture_kinds.base import Equipment
-from lab.diagnose.evidence.causes import Cause, causes_of, library_family
+from lab.diagnose.evidence.causes import Cause, causes_of
 from lab.diagnose.evidence.doubt import doubt_of
 from lab.diagnose.evidence.improved import Improved, improve
+from lab.diagnose.evidence.laws import laws_of
 from lab.diagnose.evidence.places import (
     contradicted,
     detectability,
@@ -26,11 +27,13 @@ from lab.diagnose.evidence.places import (
     unresolved,
 )
 from lab.diagnose.evidence.side_table import SideTable, predict_by_baseline
-from lab.diagnose.metadata import misstatements, unchecked
+from lab.diagnose.metadata import unchecked
 from lab.diagnose.metadata.stated_light import impossible_efficiency, misstated_light
+from lab.diagnose.outcome.mismatches import board_departure
 from lab.diagnose.outcome.next_capture import Doubt
 from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.outcome.settling_capture import settling_sentence
+from lab.diagnose.policy import DEFAULT_POLICY
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
@@ -39,21 +42,23 @@ from lab.formats.results import (
     FitResult,
     HeldOut,
     IncludedEffect,
+    Mismatch,
     SideModels,
     Skipped,
     Unexplained,
 )
 from lab.inference.check import check_held_out, passes
 from lab.inference.posterior import NAMED, Verdict, healthy_nothing, read_table, verdict
-from lab.inference.recordings import SideProblem, measure_side, search_side
+from lab.inference.restated import Searched, examine_side
 from lab.observables.flats.linearity import PHOTON_TRANSFER
 from sim.camera import Side
-from sim.memory import return_freed_memory
 
 #: Share of healthy cameras that are reported with a mismatch, and draws behind the threshold of p(nothing).
 FALSE_ALARM_RATE, DRAWS = 0.01, 100
 #: Probability that the listed sets hold together, and the most of them.
 SHARE, MOST_SETS = 0.95, 40
+#: Sets of less probability are left out of what sides tell each other.
+LEAST_ROW = 1e-6
 #: Seed of the draws: the same recordings give the same diagnosis.
 SEED = 1288
 
@@ -61,6 +66,15 @@ SEED = 1288
 Report = Callable[[str], None]
 #: Fits the captures that aren't held out.
 Refit = Callable[[RecordingSet], FitResult]
+
+
+@dataclass(frozen=True)
+class SetRow:
+    """A set of hypotheses, the states that have unlisted physics beside it, and its probability by one side."""
+
+    members: frozenset[str]
+    unlisted: frozenset[str]
+    probability: float
 
 
 @dataclass(frozen=True)
@@ -78,6 +92,7 @@ class EvidenceFindings:
     is_undecided : whether more than 1 % of the probability belongs to sets that had to be refitted and never were
     causes : effects and families that are probable enough to be described, likeliest first
     inclusion : prior and posterior inclusion probability of every effect and family, by name
+    rows : the sets of the table with their probabilities: members, states with unlisted physics
     metadata : statements that the recordings contradict
     improved : the improved model
     doubt : the sets that remain, and the captures that would separate them
@@ -96,6 +111,7 @@ class EvidenceFindings:
     is_undecided: bool = False
     causes: tuple[Cause, ...] = ()
     inclusion: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    rows: tuple[SetRow, ...] = ()
     metadata: tuple[Unexplained, ...] = ()
     held_out: HeldOut | None = None
     improved: CameraFile | None = None
@@ -123,26 +139,20 @@ def diagnose_side_by_evidence(
         fits.append(refit(used))
         return fits[-1]
 
-    problem = measure_side(recordings, side, None if refit is None else fitted, baseline)
-    misstated = misstatements(recordings, side)[1] if problem is None else problem.misstated
-    corrected = misstated[-1].corrected if misstated else recordings
-    metadata = tuple(one.told(side) for one in misstated)
-    remarks = tuple(unchecked(corrected, side))
-    if problem is None:
+    examined = examine_side(recordings, side, None if refit is None else fitted, baseline, report)
+    measured, searched = examined.recordings, examined.searched
+    metadata = tuple(one.told(side) for one in examined.wrong)
+    remarks = tuple(unchecked(measured, side))
+    if searched is None:
         return EvidenceFindings(side, DiagnosisLists(skipped=remarks, unexplained=metadata), metadata=metadata)
-    problem.groups  # noqa: B018  (they need what is shared between frames)
-    for one in (recordings, corrected, problem.dataset.recordings):
-        one.let_go()
-    return_freed_memory()
     fit = fits[-1] if fits else None
-    report("searching the sets of effects")
-    reading = _read(corrected, side, problem)
     report("reading the table")
+    reading = _read(measured, side, searched)
     return _findings(reading, fit, baseline, metadata, remarks, pictures=pictures, station=station)
 
 
-def _read(recordings: RecordingSet, side: Side, problem: SideProblem) -> SideTable:
-    search, table = search_side(problem)
+def _read(recordings: RecordingSet, side: Side, searched: Searched) -> SideTable:
+    problem, search, table = searched.problem, searched.search, searched.table
     return SideTable(
         recordings=recordings,
         side=side,
@@ -171,7 +181,8 @@ def _findings(
     named = [cause for cause in causes if cause.probability >= NAMED]
     passed = passes(reading.checked)
     said = verdict(posterior, reading.least_nothing, passed)
-    improved = improve(reading, fit, baseline, named)
+    laws = laws_of(reading)
+    improved = improve(reading, fit, baseline, named, laws)
     after = reading.gaussian(improved.fit, improved.unlisted)
     before = examine_places(reading.used, reading.baseline)
     departs = said != "no_mismatch"
@@ -182,6 +193,11 @@ def _findings(
         left += unresolved(reading, before, mismatches)
     fitted = fit.cameras.get(side) if fit is not None else None
     has_levels = any(b.measurement is PHOTON_TRANSFER for b in reading.used.blocks)
+    shape = (reading.used.camera.rows, reading.used.camera.cols)
+    departure = board_departure(side, fitted.geometry if fitted is not None else None, shape, DEFAULT_POLICY)
+    if departure is not None:
+        left.append(departure)
+        mismatches.append(Mismatch(**departure.model_dump(include=set(Mismatch.model_fields))))
     stated = (
         *metadata,
         *misstated_light(side, fitted, levels_are_judged=has_levels),
@@ -194,6 +210,7 @@ def _findings(
             mismatches=tuple(mismatches),
             unexplained=(*stated, *left),
             unlisted=tuple(unlisted),
+            discovered=tuple(law.told for law in laws),
             models=(_models(reading),),
             places=tuple(examined(reading, before, after)),
             measurements=tuple(measurement_fits(reading, after)),
@@ -213,6 +230,11 @@ def _findings(
         is_undecided=posterior.is_undecided,
         causes=causes,
         inclusion=_inclusion(reading),
+        rows=tuple(
+            SetRow(row.members, frozenset(reading.table.groups[g] for g in row.unlisted), row.probability)
+            for row in reading.table.rows
+            if row.probability > LEAST_ROW
+        ),
         metadata=stated,
         held_out=held_out_of(reading),
         improved=improved.camera,
@@ -242,7 +264,7 @@ def _models(reading: SideTable) -> SideModels:
                 effects=tuple(sorted(row.members)),
                 probability=row.probability,
                 refitted=row.refitted,
-                unlisted=tuple(table.groups[g] for g in sorted(row.unlisted)),
+                unlisted=table.states(row.unlisted),
             )
         )
     included = [f for f in reading.posterior.findings if f.kind == "effect" and f.probability >= 0.001]
@@ -260,6 +282,6 @@ def _inclusion(reading: SideTable) -> dict[str, tuple[float, float]]:
     prior = reading.inclusion_prior
     families: dict[str, float] = {}
     for name, p in prior.items():
-        families[library_family(name)] = families.get(library_family(name), 0.0) + p
+        families[reading.family_of(name)] = families.get(reading.family_of(name), 0.0) + p
     found = {f.name: f.probability for f in reading.posterior.findings if f.kind in ("effect", "family")}
     return {name: (p, found.get(name, 0.0)) for name, p in {**families, **prior}.items()}

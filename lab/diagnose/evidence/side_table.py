@@ -17,6 +17,7 @@ from lab.inference.model import State, everyday_scales, scaled_columns, with_col
 from lab.inference.posterior import Posterior
 from lab.inference.recordings import SideModel, SideProblem
 from lab.inference.search import FittedSet, Search, Table
+from lab.inference.statements.found import is_statement
 from lab.observables.gaussian import Gaussian, chi2, conditional
 from lab.observables.observable import Observable
 from sim.camera import Side
@@ -51,17 +52,22 @@ class SideTable:
     @cached_property
     def whole(self) -> MeasurementModel:
         """The model of the numbers that are used, and after them of those that are held out, marked so."""
-        count, n = len(self.problem.measured.blocks), len(self.problem.whole.value)
-        unstated = {
-            name: np.concatenate([column, np.zeros(n - len(column))])
-            for name, column in self.problem.measured.unstated_jacobian.items()
-        }
-        return replace(_marked(self.problem.whole, lambda k: k >= count), unstated_jacobian=unstated)
+        count = len(self.problem.measured.blocks)
+        return _marked(self.problem.whole, lambda k: k >= count)
 
     @property
     def effects_of(self) -> Callable[[State], tuple[Effect, ...]]:
-        """State of a set -> its effects."""
+        """State of a set -> its effects, without wrong statements."""
         return self.model.effects
+
+    def family_of(self, name: str) -> str:
+        """Return the identifier of a hypothesis' family."""
+        return self.search.hypotheses[name].family
+
+    @cached_property
+    def statements(self) -> frozenset[str]:
+        """Names of the hypotheses that are wrong statements, and no effects."""
+        return frozenset(name for name, one in self.search.hypotheses.items() if is_statement(one))
 
     @property
     def model(self) -> SideModel:

@@ -25,6 +25,7 @@ from lab.observables.noise.figures import NoiseFigures
 from lab.observables.observable import Observable, Prediction
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Effects
+from sim.effects.library import list_changes
 from sim.spectrum import FloatArray
 
 #: Limits of the caches: entries of covariances (80 MB, and as much of their factors), and predictions.
@@ -68,7 +69,7 @@ class MeasurementModel:
     _covariances: dict[tuple[bytes, tuple[int, ...], tuple[float, float]], BlockCovariance] = field(
         default_factory=dict
     )
-    _numbers: dict[Effect, int] = field(default_factory=dict)
+    _numbers: dict[Effect, _NumberedEffect] = field(default_factory=dict)
 
     # --- the numbers -------------------------------------------------------------------------------------------------
 
@@ -145,7 +146,16 @@ class MeasurementModel:
     # --- predictions -------------------------------------------------------------------------------------------------
 
     def _numbered(self, acting: Effects) -> list[_NumberedEffect]:
-        return [_NumberedEffect(self._numbers.setdefault(e, len(self._numbers)), self.acts(type(e)), e) for e in acting]
+        return [self._numbers.get(e) or self._number(e) for e in acting]
+
+    def _number(self, effect: Effect) -> _NumberedEffect:
+        """Give an effect a number. As it stands it may change less than its kind: a law on any stage acts on one."""
+        changes = list_changes(effect)
+        acts = tuple(
+            may and not changes.isdisjoint(block.reads | block.scattered_by)
+            for may, block in zip(self.acts(type(effect)), self.blocks, strict=True)
+        )
+        return self._numbers.setdefault(effect, _NumberedEffect(len(self._numbers), acts, effect))
 
     def _prediction(self, index: int, acting: list[_NumberedEffect]) -> Prediction:
         here = [e for e in acting if e.acts[index]]
@@ -192,14 +202,14 @@ class MeasurementModel:
         return found
 
     @cached_property
-    def _single_block_nuisances(self) -> frozenset[str]:
+    def single_block_nuisances(self) -> frozenset[str]:
         """Nuisance parameters of one block alone, which belong to the covariance of that block."""
         count = Counter(name for i in range(len(self.blocks)) for name in self._prediction(i, []).jacobian)
         return frozenset(name for name, blocks in count.items() if blocks == 1)
 
     def _shared_jacobian(self, effects: Effects) -> FloatArray:
         """Return the Jacobian by nuisance parameters of several blocks, (n, k)."""
-        columns = list(self.nuisance_jacobian(effects, self._single_block_nuisances).values())
+        columns = list(self.nuisance_jacobian(effects, self.single_block_nuisances).values())
         return np.column_stack(columns) if columns else np.zeros((len(self.value), 0))
 
     # --- distributions -----------------------------------------------------------------------------------------------
@@ -259,7 +269,7 @@ class MeasurementModel:
             block, both = self.blocks[index], np.ix_(only, only)
             covariance = block.covariance[both].copy()
             prediction = self._prediction(index, here)
-            own = [c[only] for name, c in prediction.jacobian.items() if name in self._single_block_nuisances]
+            own = [c[only] for name, c in prediction.jacobian.items() if name in self.single_block_nuisances]
             if own:
                 covariance += np.transpose(own) @ np.array(own)
             for i, one in enumerate(here):

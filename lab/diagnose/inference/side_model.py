@@ -87,7 +87,7 @@ def measurement_model(
     known = dataset.noise.gain_is_known
     model = MeasurementModel(tuple(blocks), dataset.camera, always, gain_is_known=known, noise=dataset.noise)
     if dataset.stated.fill_factor is None and baseline is None:
-        model = replace(model, unstated_jacobian=_any_aperture(model))
+        model = replace(model, unstated_jacobian=any_aperture(model))
     return model, tuple(skipped)
 
 
@@ -109,18 +109,20 @@ def _far_from_full(dataset: Dataset) -> list[Skipped]:
     return [Skipped(step="diagnose full_well_e", reason=reason, side=dataset.side)]
 
 
-def _any_aperture(model: MeasurementModel) -> dict[str, FloatArray]:
+def any_aperture(model: MeasurementModel, used: int | None = None) -> dict[str, FloatArray]:
     """Jacobian by an unstated pixel aperture: name -> (n,) per prior standard deviation.
 
     The changes of the predicted mean by `APERTURES` sides, evenly spaced from `LEAST_SIDE` to 1 px, are divided by
-    sqrt(`APERTURES`). The columns are the principal components of these, each times its singular value.
+    sqrt(`APERTURES`). The columns are the principal components of these, each times its singular value: those of the
+    first `used` numbers (None: of all), by which the same apertures change the others.
     """
     camera, sides = model.camera, np.linspace(LEAST_SIDE, 1.0, APERTURES, endpoint=False)
     lowest = PixelAperture.quantities()["side_change_um"].lower or -np.inf
     effects = [PixelAperture(side_change_um=max(lowest, (s - 1.0) * camera.pixel_pitch_um)) for s in sides]
-    changes = np.array([model.mean((e,)) for e in effects]) - model.mean()
-    _, size, direction = np.linalg.svd(changes / np.sqrt(APERTURES), full_matrices=False)
-    return {f"aperture:{k}": size[k] * direction[k] for k in range(APERTURE_DIRECTIONS) if size[k] > 0.0}
+    changes = (np.array([model.mean((e,)) for e in effects]) - model.mean()) / np.sqrt(APERTURES)
+    mixture, size, _ = np.linalg.svd(changes[:, :used], full_matrices=False)
+    most = min(APERTURE_DIRECTIONS, len(size))
+    return {f"aperture:{k}": mixture[:, k] @ changes for k in range(most) if size[k] > 0.0}
 
 
 def _saturation_dn(fit: CameraFit | None) -> float | None:

@@ -28,6 +28,7 @@ class Misstatement:
     captures: tuple[str, ...]
     corrected: RecordingSet  # the recordings with the value that fits, or without the captures
     correction: str = "the value that fits is taken in its place"
+    probability: float | None = None  # that it is wrong; None where it wasn't weighed
 
     def told(self, side: Side) -> Unexplained:
         """Return the misstatement as an item of a result."""
@@ -44,6 +45,7 @@ class Misstatement:
             captures=self.captures,
             correction=self.correction,
             check=self.check,
+            probability=self.probability,
         )
 
 

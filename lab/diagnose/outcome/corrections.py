@@ -3,16 +3,18 @@ the sensitivity curves."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from lab.diagnose.inference.measurement_model import form_name
+from lab.formats.camera_file import CameraFile
 from lab.observables.observable import Observable
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.empirical_law import EmpiricalLaw
 from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.spectrum import FloatArray, Spectrum
 
@@ -101,6 +103,15 @@ def _of(
     factor: FloatArray,
 ) -> ModelDiscrepancy:
     return ModelDiscrepancy(along=along, at=tuple(x.tolist()), factor=tuple(factor.tolist()), strength=1.0)
+
+
+def with_laws(improved: CameraFile, laws: Sequence[Effect]) -> CameraFile:
+    """Return the improved model with discovered laws; what they add to the dark noise, its read noise loses."""
+    noise = [law for law in laws if isinstance(law, EmpiricalLaw) and (law.stage, law.of) == ("signal", "variance")]
+    added_e2 = sum(float(np.mean(law.table)) for law in noise)
+    read_e = float(np.sqrt(max(improved.camera.read_noise_e**2 - added_e2, 0.0)))
+    camera = improved.camera.model_copy(update={"read_noise_e": read_e}) if added_e2 else improved.camera
+    return replace(improved, camera=camera, effects=(*improved.effects, *laws))
 
 
 def scaled_curve(curve: Spectrum, factor: float) -> Spectrum:

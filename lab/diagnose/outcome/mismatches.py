@@ -21,7 +21,6 @@ from lab.diagnose.inference.weigh import UNKNOWN, Candidate
 from lab.diagnose.outcome.corrections import Correction
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
-from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
     GeometryFit,
@@ -346,14 +345,6 @@ def left_to_smooth(verdict: Verdict, words: dict[int, str]) -> list[Discrepancy]
     return [
         replace(one, log_odds=min(one.log_odds, 0.0)) if one.index in words else one for one in verdict.discrepancies
     ]
-
-
-def with_laws(improved: CameraFile, laws: Sequence[EmpiricalLaw]) -> CameraFile:
-    """Return the improved model with discovered laws; what they add to the dark noise, its read noise loses."""
-    added_e2 = sum(float(np.mean(law.table)) for law in laws if law.stage == "signal" and law.of == "variance")
-    read_e = float(np.sqrt(max(improved.camera.read_noise_e**2 - added_e2, 0.0)))
-    camera = improved.camera.model_copy(update={"read_noise_e": read_e}) if added_e2 else improved.camera
-    return replace(improved, camera=camera, effects=(*improved.effects, *laws))
 
 
 def corrected_by_laws(

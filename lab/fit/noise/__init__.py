@@ -11,7 +11,7 @@ Definitions: EMVA Standard 1288, release 4.0 (linear). The steps, one module eac
 - `photon_transfer`: conversion gain and curvature from variances against means;
 - `dark_current` (black level, read noise, dark current), `fixed_pattern` (DSNU, PRNU, shading), `response` (linearity,
   full well, quantum efficiency, curvature of the variance);
-- `emva1288`: the figures by the letter of the standard, beside the physical fit;
+- `emva1288`: the figures as specified in the standard, in addition to the physical fit;
 - `lab.observables.darks.pixels`, `pixel_maps`: figures and maps of single pixels;
 - `noise_fit`: the step on a recording set, and its results.
 

@@ -56,7 +56,7 @@ def level_consistency(
         votes = np.mean([law.outlier for law in laws.values()], axis=0) >= 0.5
         for number in np.flatnonzero(votes):
             level = own[number]
-            found[id(level)] = _described(level, int(number), laws, recorded, dark, lamp)
+            found[id(level)] = _describe(level, int(number), laws, recorded, dark, lamp)
             sources = _source(own, int(number), recorded, dark, saturation)
             remarks.add(_sentence(found[id(level)], sources))
     rest = [level for level in recorded.flats if id(level) not in found]
@@ -108,7 +108,7 @@ def _dark_scatter_dn(recorded: RecordedLevels, dark: DarkSignal, name: str) -> f
     return float(np.sqrt(np.sum(np.square(rest)) / (len(rest) - 2)))
 
 
-def _described(
+def _describe(
     level: MeasuredLevel,
     number: int,
     laws: dict[str, RobustResponse],

@@ -14,7 +14,6 @@ from lab.observables.flats.level_lines import mean_and_std
 from lab.observables.weighted_lines import chi2_factor, dark_line, least_squares
 from sim.parameters import Frozen
 
-# --- temperature law -----------------------------------------------------------------------------------------------
 # The law of the dark current against temperature.
 
 
@@ -103,7 +102,6 @@ def temperature_law(found: Sequence[tuple[float, float, float]], gain_error: flo
     return plain.model_copy(update=update)
 
 
-# --- read noise ----------------------------------------------------------------------------------------------------
 # Read noise and black level from the darks, and whether rounding hides them.
 
 
@@ -176,7 +174,6 @@ def dark_signal_hidden(e: Evaluation) -> bool:
     return True
 
 
-# --- dark current --------------------------------------------------------------------------------------------------
 # Dark current: from the dark means, from the dark variances, and against temperature.
 
 

@@ -220,7 +220,7 @@ def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
     gain = at.gain(used)
     if not gain.value > 3.0 * gain.std:
         return "the temporal variance doesn't grow with the signal: no system gain"
-    gain = _widened_gain(at, used, gain, remarks)
+    gain = _widen_gain(at, used, gain, remarks)
     if at.signal.size < 50:
         remarks.append(f"{at.signal.size} levels; the standard asks for 50")
     missing = sum(source is None for source in at.source)
@@ -250,7 +250,7 @@ def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
         system_gain_dn_per_e_std=gain.std,
         temporal_dark_noise_limit_e=limit_e,
         wavelength_nm=given.wavelength_nm if given.in_photons else None,
-        points=_plotted(at, given, deviation, stacks),
+        points=_plot_points(at, given, deviation, stacks),
         remarks=tuple(remarks),
     )
 
@@ -295,7 +295,7 @@ def _saturation(at: EmvaLevels, given: EmvaInput, remarks: list[str]) -> tuple[f
     return given.saturation_dn, None
 
 
-def _widened_gain(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list[str]) -> Measured:
+def _widen_gain(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list[str]) -> Measured:
     """Return the system gain with what its line leaves of the variances in its standard deviation."""
     std = np.hypot(at.variance_std, at.below(at.dark_variance_std, None))
     signal = at.signal[used]
@@ -542,7 +542,7 @@ def _parts(split: SpatialVariance) -> dict[str, Measured]:
     }
 
 
-def _plotted(at: EmvaLevels, given: EmvaInput, deviation: FloatArray, stacks: _Stacks) -> Emva1288Points:
+def _plot_points(at: EmvaLevels, given: EmvaInput, deviation: FloatArray, stacks: _Stacks) -> Emva1288Points:
     def values_of(values: FloatArray) -> tuple[float, ...]:
         return tuple(float(value) for value in values)
 

@@ -61,7 +61,6 @@ from lab.observables.noise.surface import DEFECT_SIGMA
 from lab.observables.weighted_lines import chi2_factor, root
 from sim.camera import Side
 
-# --- fixed pattern ---------------------------------------------------------------------------------------------------
 # Fixed pattern: DSNU, PRNU, and the symmetry of the shading.
 
 
@@ -156,10 +155,6 @@ def remark_on_shading(e: Evaluation) -> None:
         e.remarks.add(f"the flats' shading is asymmetric: {'; '.join(found)}, of the mean")
 
 
-# --- noise fit ------------------------------------------------------------
-
-
-# --- noise fit -----------------------------------------------------------------------------------------------------
 # The noise fit of one camera: all figures, by channel too, with the points of its plots.
 
 
@@ -252,7 +247,7 @@ def channel_figures(e: Evaluation, principal: dict[str, float | None]) -> dict[s
 
 
 def emva1288_by_plane(e: Evaluation) -> dict[str, Emva1288]:
-    """Figures by the letter of EMVA 1288, by plane; what a plane lacks is reported."""
+    """Compute the figures as specified in EMVA 1288, by plane; what a plane lacks is reported."""
     found: dict[str, Emva1288] = {}
     main = sorted(main_lamp_levels(e), key=lambda level: level.light)
     lamp = main[0].lamp
@@ -356,7 +351,6 @@ def remark_on_planes(e: Evaluation) -> None:
         e.remarks.add(f"the planes differ in conversion gain ({listed} DN/e): the one given is their mean")
 
 
-# --- recordings ----------------------------------------------------------------------------------------------------
 # The noise fit of a recording set: darks and flats of one camera, grouped into levels.
 
 
@@ -452,7 +446,6 @@ def _lamps_of(
     }
 
 
-# --- The noise fit on a table of channel means and variances, for recordings whose frames aren't at hand --------------
 #
 # One row a level and channel, CSV with a header. Columns: `kind` (dark, flat), `exposure_s`, `mean_dn`, `variance_dn2`
 # (temporal, of single pixels), `pixels` (of the channel, over which both were taken), `repeats` (frames); where known
@@ -548,14 +541,14 @@ def _level(row: TableRow, camera: DataSheet) -> tuple[Setting, PlaneStatistics]:
 def _without_patterns(fit: NoiseFit) -> NoiseFit:
     """Return the fit less the figures that need frames."""
 
-    def emptied(part: NoiseFit | ChannelNoise | Emva1288) -> dict[str, object]:
+    def empty_spatial(part: NoiseFit | ChannelNoise | Emva1288) -> dict[str, object]:
         return {name: None for name in type(part).model_fields if name.startswith(SPATIAL)}
 
-    channels = {c: part.model_copy(update=emptied(part)) for c, part in fit.channels.items()}
+    channels = {c: part.model_copy(update=empty_spatial(part)) for c, part in fit.channels.items()}
     figures = {}
     for c, part in fit.emva1288.items():
         remarks = tuple(text for text in part.remarks if not text.startswith("the spatial stacks"))
-        figures[c] = part.model_copy(update=emptied(part) | {"remarks": remarks})
+        figures[c] = part.model_copy(update=empty_spatial(part) | {"remarks": remarks})
     remark = "of a table of means and variances: DSNU, PRNU, shading and defects aren't determined"
-    update = emptied(fit) | {"channels": channels, "emva1288": figures, "remarks": (*fit.remarks, remark)}
+    update = empty_spatial(fit) | {"channels": channels, "emva1288": figures, "remarks": (*fit.remarks, remark)}
     return fit.model_copy(update=update)

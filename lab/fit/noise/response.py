@@ -12,7 +12,6 @@ from lab.observables.noise.levels import MeasuredLevel
 from lab.observables.weighted_lines import Linearity, chi2_factor, least_squares, linearity
 from sim.spectrum import FloatArray
 
-# --- response ------------------------------------------------------------------------------------------------------
 # The response to light: linearity, full well, quantum efficiency, drift of the lamp between levels.
 
 
@@ -177,7 +176,6 @@ def remark_on_scatter(e: Evaluation) -> None:
         )
 
 
-# --- variance curvature --------------------------------------------------------------------------------------------
 # What bends the photon-transfer curve: the response, or missing noise (brighter-fatter).
 
 

@@ -81,7 +81,7 @@ def normal_equations(sharp: Array, blurred: Array, support: int) -> NormalEquati
     for down in range(s):
         # Element (i, j) sees the window that begins at (2 h - i, 2 h - j), element (i + down, j') the one `down` rows
         # above
-        sums = _lagged_sums(u, padded[s - 1 - down : s - 1 - down + rows], tall, wide)
+        sums = _sum_lagged(u, padded[s - 1 - down : s - 1 - down + rows], tall, wide)
         part = sums[s - 1 - i[: s - down], s - 1 - j, s - 1 + j - j.T]
         at = np.arange(s - down)
         gram[at, :, at + down, :] = part
@@ -100,7 +100,7 @@ def _window_sums(picture: Array, tall: int, wide: int) -> Array:
     return np.asarray(by_row[:, wide:] - by_row[:, : by_row.shape[1] - wide])
 
 
-def _lagged_sums(u: Array, other: Array, tall: int, wide: int) -> Array:
+def _sum_lagged(u: Array, other: Array, tall: int, wide: int) -> Array:
     """Sum u[r, c] other[r, c + lag] over the windows of `tall` x `wide` that begin at (row, col): (s, s, 2 s - 1).
 
     `u` (rows, cols), `other` (rows, cols + 2 s - 2), s = cols - wide + 1. Over the first window by matrix products of
@@ -325,7 +325,7 @@ def envelope_of(kernel: Array) -> Array:
     return np.asarray(np.maximum(local / local.max(), 5e-4).ravel())
 
 
-def most_likely_prior(
+def find_most_likely_prior(
     information: Array, weighted: Array, kernel: Array, start: tuple[int, int]
 ) -> tuple[KernelPrior, tuple[int, int]]:
     """Find the prior whose length and strength maximise the marginal likelihood, by coordinate ascent on their grid
@@ -436,7 +436,7 @@ def solve_kernel(
         precision[size, size] = OUTSIDE_STD**-2
     at = (2, 1)
     for last in range(1 - rounds if prior_of is None else 1, 1):
-        prior, at = most_likely_prior(reduced, reduced_right, found[:size].reshape(support, support), at)
+        prior, at = find_most_likely_prior(reduced, reduced_right, found[:size].reshape(support, support), at)
         precision[:size, :size] = prior.precision()
         found = on_simplex(information + precision, weighted, found, solves if last == 0 else 3)
     if prior_of is not None:

@@ -42,7 +42,7 @@ def radial_symmetry(parts: Sequence[ScreenKernel], axis_px: tuple[float, float])
     top = float(radius.max())
     values, weights, designs = [], [], []
     for kernel, r in zip(parts, radius, strict=True):
-        moments, covariance = _windowed_moments(kernel)
+        moments, covariance = _window_moments(kernel)
         offset = np.array(kernel.centre_px) - axis_px
         u = offset / r if r > 1e-6 else np.array([1.0, 0.0])
         v = np.array([-u[1], u[0]])
@@ -77,7 +77,7 @@ def radial_symmetry(parts: Sequence[ScreenKernel], axis_px: tuple[float, float])
     )
 
 
-def _windowed_moments(kernel: ScreenKernel) -> tuple[Array, Array]:
+def _window_moments(kernel: ScreenKernel) -> tuple[Array, Array]:
     """Measure the second moments (row row, row col, col col) of a kernel under a Gaussian window about its centroid,
     px^2, and their covariance (3, 3).
     """

@@ -219,7 +219,7 @@ def _line(row: TableRow) -> _MeasuredLine:
     width.
     """
     if name := row.cells.get(SPECTRUM):
-        spectrum = _measured_spectrum(row.file, name)
+        spectrum = _read_spectrum(row.file, name)
         wavelength_nm, value = spectrum.arrays
         high = value > LINE_SHARE * value.max()
         middle_nm = float(np.average(wavelength_nm[high], weights=value[high]))
@@ -236,7 +236,7 @@ def _line(row: TableRow) -> _MeasuredLine:
     return _MeasuredLine(centre, width)
 
 
-def _measured_spectrum(table: Path, name: str) -> Spectrum:
+def _read_spectrum(table: Path, name: str) -> Spectrum:
     """Read the spectrum in the file `name` beside the table, with light in it. Raises InputError."""
     try:
         spectrum = parse_spectrum(read_foreign_csv(locate(table.parent, name)).text)
@@ -279,7 +279,7 @@ def _power(row: TableRow) -> float:
     """Return the power of a row's light, up to a factor. Raises InputError where it is stated twice or not at all."""
     radiance, current = row.known(RADIANCE), row.known(PHOTODIODE)
     if radiance is None and current is None and (name := row.cells.get(SPECTRUM)):
-        wavelength_nm, value = _measured_spectrum(row.file, name).arrays
+        wavelength_nm, value = _read_spectrum(row.file, name).arrays
         return float(np.trapezoid(value, wavelength_nm))
     if (radiance is None) == (current is None):
         raise InputError(
@@ -396,7 +396,7 @@ def _fit_curves(lights: Sequence[_TableLight], channels: Sequence[str], remarks:
     )
 
 
-def _measured_photons(light: _TableLight, spectrum: Spectrum, wave: FloatArray) -> FloatArray:
+def _count_photons(light: _TableLight, spectrum: Spectrum, wave: FloatArray) -> FloatArray:
     """Return the photons per nm, up to a factor, of a light whose spectrum was measured, averaged over the steps of the
     grid.
     """
@@ -437,7 +437,7 @@ def _photons(light: _TableLight, wave: FloatArray, factor: float) -> FloatArray:
     with equal slits has, or as it was measured.
     """
     if light.spectrum is not None:
-        return _measured_photons(light, light.spectrum, wave)
+        return _count_photons(light, light.spectrum, wave)
     shape = np.clip(1.0 - np.abs(wave - light.wavelength_nm) / (factor * light.bandwidth_nm), 0.0, None)
     area = float(np.sum(shape * trapezoid_weights(wave)))
     if area <= 0.0:  # narrower than the grid, and between its points

@@ -1,49 +1,36 @@
 """Importers: other formats as recording sets. Each turns a path into a `RecordingSet` whose frames are decoded when
 asked for; `lab.formats.recording_set.write` checks it and puts it on disk, completely or not at all. The set's
 `warnings` say what an importer left out, assumed or didn't find; the manifest's `notes` keep them. What can't be known
-is asked for: on the command line (`ImportOptions`), or in a descriptor."""
+is asked for: on the command line (`ImportOptions`), or in a descriptor. `lab.foreign_recordings` lists them by name."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
-from lab.errors import InputError
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.importers.fits_folder import read_fits_folder
-from lab.formats.importers.frame_settings import HeaderChoice, parse_choice
 from lab.formats.importers.raw_folder import (
     read_boards,
     read_checkerboard_pairs,
     read_dot_grids,
     read_raw_folder,
 )
-from lab.formats.importers.single_picture import ImportOptions, read_colour_chart, read_slanted_edge
-from lab.formats.recording_set import Manifest, RecordingSet, text_problems
-from lab.plain_text import escaped
-from sim.extensions import extensions, refuse
+from lab.formats.importers.single_picture import ImportOptions, read_colour_chart
+from lab.formats.recording_set import RecordingSet
 
 __all__ = [
-    "KINDS",
     "ImportOptions",
     "Importer",
-    "importers",
     "read_boards",
     "read_checkerboard_pairs",
     "read_colour_chart",
     "read_dot_grids",
     "read_emva1288",
     "read_fits_folder",
-    "read_foreign",
     "read_raw_folder",
-    "read_slanted_edge",
 ]
-
-
-#: Endings of archives, which are unpacked before an import.
-ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".7z", ".rar")
 
 
 @dataclass(frozen=True)
@@ -54,104 +41,3 @@ class Importer:
     takes: frozenset[str] = frozenset()
     of_a_file: bool = False
     of_a_folder: bool = False
-
-
-def _choice(options: ImportOptions) -> HeaderChoice:
-    return parse_choice(options.only or "", options.ignore or "")
-
-
-def _raw_folder(path: Path, options: ImportOptions) -> RecordingSet:
-    if options.checkerboard is None:
-        return read_raw_folder(path, options.tap or "", _choice(options))
-    if not options.square_mm:
-        raise InputError("--checkerboard: state --square-mm, the side of its squares")
-    return read_checkerboard_pairs(path, options.checkerboard, options.square_mm)
-
-
-def _dot_grids(path: Path, options: ImportOptions) -> RecordingSet:
-    if options.dots is None or not options.square_mm:
-        raise InputError(
-            "--from dot-grid: state --dots ROWSxCOLS and --square-mm, the spacing of the dots, as in 9x12 and 10"
-        )
-    return read_dot_grids(path, options.dots, options.square_mm)
-
-
-def _checkerboards(path: Path, options: ImportOptions) -> RecordingSet:
-    if options.checkerboard is None or not options.square_mm:
-        raise InputError(
-            "--from checkerboard: state --checkerboard ROWSxCOLS, its inner corners, and --square-mm, the side of its "
-            "squares, as in 6x9 and 25"
-        )
-    return read_boards(path, "none", options.checkerboard, options.square_mm)
-
-
-_HEADERS = frozenset({"--only", "--ignore"})
-_PICTURE = frozenset({"--camera", "--exposure-s", "--transfer"})
-#: `--from KIND` -> its importer, of this package.
-KINDS: dict[str, Importer] = {
-    "emva1288": Importer(lambda path, _: read_emva1288(path)),
-    "raw-folder": Importer(_raw_folder, _HEADERS | {"--checkerboard", "--square-mm", "--tap"}, of_a_folder=True),
-    "fits": Importer(
-        lambda path, options: read_fits_folder(path, options.tap or "", _choice(options)),
-        _HEADERS | {"--tap"},
-        of_a_folder=True,
-    ),
-    "slanted-edge": Importer(read_slanted_edge, _PICTURE | {"--channel"}, of_a_file=True),
-    "colorchecker": Importer(read_colour_chart, _PICTURE | {"--corners", "--light", "--white-patch"}, of_a_file=True),
-    "dot-grid": Importer(_dot_grids, frozenset({"--dots", "--square-mm"})),
-    "checkerboard": Importer(_checkerboards, frozenset({"--checkerboard", "--square-mm"})),
-}
-
-
-@cache
-def importers() -> dict[str, Importer]:
-    """Return all importers by their KIND: those above, and entry points of `calibench.importers` in other packages."""
-    found = dict(KINDS)
-    for name, added in extensions("importers"):
-        if not isinstance(added, Importer):
-            refuse("importers", name, f"{added!r} is no lab.formats.importers.Importer")
-        elif name in KINDS:
-            refuse("importers", name, f"there is an importer {name!r} already")
-        else:
-            found[name] = added
-    return found
-
-
-def read_foreign(kind: str, path: Path, options: ImportOptions | None = None) -> RecordingSet:
-    """Return the recordings at `path`, which are of `kind`; InputError where there is no such kind, it doesn't take one
-    of the options, or the recordings can't be used."""
-    options = options or ImportOptions()
-    known = importers()
-    if kind not in known:
-        raise InputError(f"--from {kind}: no such format; choose {', '.join(known)}")
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder; give that of the recordings")
-    importer = known[kind]
-    if path.is_dir() and importer.of_a_file:
-        raise InputError(f"{path}: is a folder; give one picture")
-    if path.is_file() and importer.of_a_folder:
-        is_archive = path.name.lower().endswith(ARCHIVES)
-        remedy = "unpack it, and give the folder" if is_archive else "give the folder that it is in"
-        raise InputError(f"{path}: is a file; {remedy}")
-    alien = [name for name in options.stated() if name not in importer.takes]
-    if alien:
-        takes = ", ".join(sorted(importer.takes)) or "none"
-        raise InputError(f"--from {kind} doesn't take {', '.join(alien)}; it takes {takes}")
-    if path.is_dir() and not any(path.iterdir()):
-        raise InputError(f"{path}: is empty; give the folder of the recordings")
-    recordings = importer.read(path, options)
-    manifest = _with_notes(recordings, path)
-    if problems := list(text_problems(manifest.model_dump(exclude_unset=True))):
-        raise InputError("\n".join(f"{path}: {line}" for line in problems))
-    return recordings.under(manifest)
-
-
-def _with_notes(recordings: RecordingSet, path: Path) -> Manifest:
-    """Return the manifest with the warnings in its notes, one a line, without the folder in which the recordings
-    were."""
-    folder = path if path.is_dir() else path.parent
-    lines = [line.removeprefix(f"{folder}: ") for line in recordings.warnings]
-    if folder != Path():
-        lines = [line.replace(f"{folder}/", "") for line in lines]
-    notes = escaped("\n".join([recordings.manifest.notes, *lines]), several_lines=True)
-    return recordings.manifest.model_copy(update={"notes": notes})

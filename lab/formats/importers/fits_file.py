@@ -156,9 +156,6 @@ def has_keyword(file: Path, keyword: str) -> bool:
     return keyword in _header(file)
 
 
-# --- Files ------------------------------------------------------------------------------------------------------------
-
-
 @contextmanager
 def _stream(file: Path) -> Iterator[IO[bytes]]:
     """The file's bytes, uncompressed. Raises InputError where there are too many of them."""
@@ -251,9 +248,6 @@ def _planes_of(header: Any) -> int:
         return _planes(shape)
     except InputError:
         return 1
-
-
-# --- Values -----------------------------------------------------------------------------------------------------------
 
 
 def _kind_of(value: Any) -> str | None:

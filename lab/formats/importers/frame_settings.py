@@ -104,9 +104,6 @@ def is_same(keyword: str, one: Value, other: Value) -> bool:
     return low == high or (setting is not None and low > 0 and high <= low * setting.factor)
 
 
-# --- Differences ------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class StatedFrame:
     """A capture with its file and the settings that its header states, by keyword."""
@@ -245,9 +242,6 @@ def _unstated(own: Sequence[StatedFrame], where: str) -> Iterator[str]:
     for names, keywords in missing.items():
         some = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
         yield f"{where}: {some}: no {', '.join(keywords)} in the header, unlike the others': taken as theirs"
-
-
-# --- Options ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -149,7 +149,6 @@ def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> 
     return cameras
 
 
-# --- Sensors that are read out by several taps, with overscan: `[[taps]]` of `camera.toml` ----------------------------
 #
 #     [[taps]]
 #     name = "A"

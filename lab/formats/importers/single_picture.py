@@ -36,8 +36,6 @@ from sim.scene.colorchecker import reflectances
 from sim.sensor import mosaic
 from sim.spectrum import Spectrum
 
-# --- Options of an import: what the user states because a format doesn't hold it --------------------------------------
-
 
 @dataclass(frozen=True)
 class ImportOptions:
@@ -112,28 +110,6 @@ PADS, RIM_CODE = (0.0, 0.125), 110
 Corners = tuple[tuple[float, float], ...]
 
 
-def read_slanted_edge(path: Path, options: ImportOptions) -> RecordingSet:
-    """Return a picture with slanted edges as a recording set of one capture, whose edges are looked for.
-
-    Raises InputError with all that isn't stated, in one line, or where no edge is found in the picture.
-    """
-    from lab.errors import NotDetermined
-    from lab.observables.edges.region import find_edges
-
-    frame, camera, notes = _picture(path, options, lambda image: _one_channel(image, options), ())
-    try:
-        found = find_edges(frame, camera.cfa, camera.saturation_dn)
-    except NotDetermined as refused:
-        is_lossy = path.suffix.lower() in IMAGES and picture_facts(path).is_lossy
-        remedy = "a JPEG changes edges and noise: give the raw or a PNG" if is_lossy else "give a picture of one"
-        raise InputError(f"{path}: no slanted edge: {refused.reason}; {remedy}") from refused
-    capture = {"id": "edge", "kind": "slanted_edge"}
-    usable = [edge for edge in found if not edge.refused]
-    angles = ", ".join(f"{edge.angle_deg:.1f}" for edge in usable)
-    notes = (*notes, f"{path}: {len(usable)} edges, at {angles} degrees from the vertical")
-    return _recordings(path, frame, camera, options, capture, notes, {})
-
-
 def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
     """Return a picture of a ColorChecker of 24 patches as a recording set of one capture; the patches are located, or
     given by their corners.
@@ -142,7 +118,7 @@ def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
     """
     lit = options.light is None and options.white_patch is None
     missing = ("--light or --white-patch (CSV of the light's radiance)",) if lit else ()
-    frame, camera, notes = _picture(path, options, _remosaiced, missing)
+    frame, camera, notes = read_picture_and_camera(path, options, _remosaiced, missing)
     corners = options.corners
     if corners is None:
         corners = located_chart(frame, camera)
@@ -153,7 +129,7 @@ def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
     _check_grey_row(path, frame, camera, corners)
     capture = {"id": "chart", "kind": "chart", "chart": CHART, "corners": corners, "radiance": "spectra/light.csv"}
     light, remarks = _light(options)
-    return _recordings(path, frame, camera, options, capture, (*notes, *remarks), {"spectra/light.csv": light})
+    return build_recording_set(path, frame, camera, options, capture, (*notes, *remarks), {"spectra/light.csv": light})
 
 
 def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
@@ -211,7 +187,7 @@ def _upright(frame: Frame, camera: DataSheet, corners: Corners) -> Corners:
     return max(front, key=lambda c: -float(np.polyfit(np.arange(PATCH_COLS), grey_levels(frame, c), 1)[0]))
 
 
-def _picture(
+def read_picture_and_camera(
     path: Path,
     options: ImportOptions,
     plane_of: Callable[[NDArray[Any]], tuple[Frame, str]],
@@ -329,7 +305,11 @@ def _linear(frame: Frame, keys: dict[str, Any]) -> tuple[Frame, dict[str, Any]]:
     return made, keys | changed | {"bit_depth": LINEAR_BITS}
 
 
-def _one_channel(image: NDArray[Any], options: ImportOptions) -> tuple[Frame, str]:
+def take_channel(image: NDArray[Any], options: ImportOptions) -> tuple[Frame, str]:
+    """Return the stated channel of a colour picture (rows, cols, 3), and the mosaic of a monochrome camera.
+
+    Raises InputError where `options.channel` is none of R, G and B.
+    """
     if options.channel not in ("R", "G", "B"):
         raise InputError("a colour picture: state --channel R, G or B, or give the raw")
     return image[..., "RGB".index(options.channel)], "MONO"
@@ -408,7 +388,7 @@ def _light(options: ImportOptions) -> tuple[Spectrum, tuple[str, ...]]:
     return Spectrum.of(wavelength_nm, value / white.at(wavelength_nm)), remarks
 
 
-def _recordings(
+def build_recording_set(
     path: Path,
     frame: Frame,
     camera: DataSheet,

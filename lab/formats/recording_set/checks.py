@@ -162,9 +162,6 @@ def _departures(light: Array, mean: Array, moved_light: Array, moved_mean: Array
     return np.sqrt(np.maximum(left, 0.0) / n)
 
 
-# --- Clipped pixels: their share of each channel, and whether a saturated flat is the top of an exposure series -------
-
-
 #: Share of clipped pixels above which a channel's level isn't measured.
 CLIPPED_LIMIT = 0.5
 #: Scale of a light that is stated as a number of photons.

@@ -18,9 +18,6 @@ from lab.formats.recording_set.manifest import DataSheet
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.spectrum import Spectrum
 
-# --- Frames and targets in files: .npy, 16-bit TIFF, and the raws that LibRaw reads -----------------------------------
-
-
 Frame = NDArray[np.uint16]
 Target = NDArray[np.uint8]
 

@@ -54,9 +54,6 @@ def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None
     return recordings
 
 
-# --- Writing a recording set as a folder: completely, or not at all ---------------------------------------------------
-
-
 MANIFEST = "manifest.json"
 
 
@@ -166,9 +163,6 @@ def write(
             f"{folder}: can't be written ({one_line(error)}); make room or choose another folder"
         ) from error
     return folder
-
-
-# --- Files as an archive, made piece by piece while it is sent: unpacked, a recording set's is what `read` takes ------
 
 
 #: A .zip has its list of files at the end; a .tar can be unpacked while it arrives.

@@ -19,7 +19,6 @@ from lab.errors import InputError, one_line
 from lab.plain_text import complaints_of, escaped
 from sim.camera import Cfa, Shutter, Side
 
-# --- What each instrument was when recordings were taken: its identity, all its settings, and what couldn't be set ----
 #
 # The instruments say it themselves, before the first capture. Two snapshots are compared by `differences`.
 
@@ -169,9 +168,6 @@ class Findings:
 
     problems: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-
-
-# --- JSON -------------------------------------------------------------------------------------------------------------
 
 
 def manifest_json(manifest: Manifest) -> str:

@@ -140,6 +140,7 @@ class Unexplained(Frozen):
     correction: str = ""  # the model discrepancy, or the discovered law, in words
     would_help: str = ""  # captures that would help where nothing predicts it, as a sentence
     check: str = ""  # stated values, of the camera or of captures, that the recordings contradict, as sentences
+    probability: float | None = None  # of a stated value: that it is wrong; None where that isn't weighed
 
     @property
     def corrects_curves(self) -> bool:
@@ -160,6 +161,12 @@ class DiscoveredLaw(Frozen):
     noise, of the table's own numbers. `own_chi2_before`, `own_chi2_after` and `own_n` are those of the table's own
     numbers throughout: of the means of its classes. `measurements`: those that it shows in. `suspects`: what physics
     may do it; none of them is a name.
+
+    By the engine `evidence`, a law is the posterior of the small physics of one `state`, given that something unlisted
+    acts there, with its `probability`: mean and standard deviations at the nodes `at`. Where no stage of the chain has
+    it, it is a curve of the `curve_of` measurement: `at` are places of its axis, each value with its channel and its
+    condition in `labels`, `table` departures in its quantity; `empirical_law` can't act so. chi2 is of the held-out
+    numbers of `measurements`, by the covariance without the law.
     """
 
     side: Side
@@ -184,6 +191,10 @@ class DiscoveredLaw(Frozen):
     measurements: tuple[str, ...] = ()
     suspects: str
     statement: str
+    state: str = ""
+    probability: float | None = None
+    curve_of: str = ""
+    labels: tuple[str, ...] = ()
 
 
 class Unlisted(Frozen):

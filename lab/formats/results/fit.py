@@ -17,9 +17,6 @@ class Skipped(Frozen):
     side: Side | None = None
 
 
-# --- Results of the noise fit: photon transfer, dark current, defective pixels, EMVA 1288 figures ---------------------
-
-
 class ChannelNoise(Frozen):
     """Photon transfer of one colour channel."""
 
@@ -83,7 +80,7 @@ class NoiseFit(ChannelNoise):
     #: noise explains them. It is part of the uncertainties of responsivity, quantum efficiency and linearity.
     response_scatter_percent: float | None = None
     channels: dict[str, ChannelNoise] = {}
-    #: By plane of the mosaic (`R`, `G1`, `G2`, `B`, or `Y`), by the letter of the standard.
+    #: By plane of the mosaic (`R`, `G1`, `G2`, `B`, or `Y`), as specified in the standard.
     emva1288: dict[str, Emva1288] = {}
     #: Amplification at which flats and darks were recorded; `conversion_gain_dn_per_e` is given for 0 dB.
     gain_db: float | None = None
@@ -283,9 +280,6 @@ class PhotonTransfer(Tabular, Frozen):
     variance_dn2_std: tuple[float, ...]
     used: tuple[bool, ...]
     linearity_residual_percent: tuple[float | None, ...]
-
-
-# --- Results of the geometry fits: intrinsics, distortion, stereo -----------------------------------------------------
 
 
 Rows = tuple[tuple[float, ...], ...]
@@ -497,9 +491,6 @@ class StereoFit(Frozen):
     depth: tuple[DepthUncertainty, ...] = ()
 
 
-# --- Results of the spectral fit: quantum efficiency per channel ------------------------------------------------------
-
-
 class MakerDeparture(Frozen):
     """A band in which the fitted quantum efficiency differs from the data sheet's curve times `maker_scale`.
 
@@ -540,9 +531,6 @@ class SpectralFit(Tabular, Frozen):
     coverage_factor: float = 2.0
     #: Assumptions of the fit, in sentences.
     remarks: tuple[str, ...] = ()
-
-
-# --- Results of the blur fits: modulation transfer functions and point-spread functions -------------------------------
 
 
 class MtfCurve(Tabular, Frozen):
@@ -592,12 +580,6 @@ class PsfSymmetry(Frozen):
     radial_growth_px2: float
     tangential_growth_px2: float
     largest_mixed_sigma: float  # largest mixed moment over its standard uncertainty
-
-
-# --- The result of `calibench fit` ------------------------------------------------------------------------------------
-
-
-# --- Repeats of one setting over time ---------------------------------------------------------------------------------
 
 
 DriftShape = Literal["trend", "decay", "warm_up", "step"]

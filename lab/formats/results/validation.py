@@ -71,9 +71,6 @@ class ValidationResult(Tabular, Frozen):
     baseline: str | None = None  # names of the camera files that stood in for the fitted cameras
 
 
-# --- The result of `calibench compare`: what changed between two calibrations -----------------------------------------
-
-
 class Change(Frozen):
     """One fitted number in two calibrations, or the point of a curve of `n` points at which they differ most.
 
@@ -141,9 +138,6 @@ class ComparisonResult(Tabular, Frozen):
     def changed(self) -> bool:
         """Whether anything changed beyond its uncertainty."""
         return any(item.changed for item in self.changes) or any(item.changed for item in self.projection)
-
-
-# --- The result of `calibench report`: where the page is, and what it shows -------------------------------------------
 
 
 class ReportFile(Frozen):

@@ -117,9 +117,6 @@ def unit_of(figure: str) -> str:
     return next((unit for end, unit in _UNITS.items() if field.endswith(end)), "1")
 
 
-# --- Quantities in words: a number with its uncertainty and its unit, as every statement, page and table writes it ----
-
-
 #: Units whose printed form differs from their form in names.
 SHOWN_UNITS = {"um": "µm", "us": "µs", "deg": "°", "C": "°C", "percent": "%", "1": ""}
 #: From this size on, numbers are written with a power of ten, and from this one on with commas.

@@ -176,7 +176,8 @@ def _mixing(
         levels = {c: float(electrons[i]) for c, i in members.items()} | {
             c: share * first for c, share in others.items()
         }
-        mixed = model.mixing_factors(levels)
+        at = points[next(iter(members.values()))]
+        mixed = model.mixing_factors(levels, (at.row, at.col))
         for c, i in members.items():
             factor[i] = mixed.get(c, 1.0)
     return factor

@@ -21,7 +21,7 @@ from lab.observables.noise.robust import CLIP
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import DARK_CURRENT, LAG, LINES, PARTICLES, acting
 from sim.effects.base import Effects
-from sim.sensor.reading_order import OrderedNoise
+from sim.sensor.reading_order import ReadOutNoise
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
@@ -108,7 +108,7 @@ def measure_dark_noise(dataset: Dataset) -> Observable:
     )  # fmt: skip
 
 
-def _slow_scatter_e2(dataset: Dataset, one: OrderedNoise) -> float:
+def _slow_scatter_e2(dataset: Dataset, one: ReadOutNoise) -> float:
     """Standard deviation of a frame's variance by the rows' few slow waves: sqrt(2 sum P^2) / pixels, P their power."""
     shape = dataset.camera.rows, dataset.camera.cols
     down = np.arange(1, shape[0]) / shape[0]

@@ -33,7 +33,7 @@ from lab.observables.reads import ADDED, LINES, READ_SPECTRUM
 from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.sensor.lines import Lines
-from sim.sensor.reading_order import OrderedNoise
+from sim.sensor.reading_order import ReadOutNoise
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
@@ -105,14 +105,14 @@ def _ordered_power(dataset: Dataset, model: Uniform, lines: Lines, frequency_cy_
     return found
 
 
-def _alternating_e2(dataset: Dataset, one: OrderedNoise, lines: Lines) -> float:
+def _alternating_e2(dataset: Dataset, one: ReadOutNoise, lines: Lines) -> float:
     """Power of noise in reading order that alternates from line to line; the difference of a frame's odd and even lines
     has 4 times that over its pixels, e^2."""
     across, down = (0.0, 0.5) if lines == "rows" else (0.5, 0.0)
     return float(one.plane_e2((dataset.camera.rows, dataset.camera.cols), np.array(across), np.array(down)))
 
 
-def _ordered_level(one: OrderedNoise) -> float:
+def _ordered_level(one: ReadOutNoise) -> float:
     """Mean power of noise in reading order in `LEVEL_BAND`, e^2, where rows hardly depend on each other."""
     return float(np.mean(one.spectrum_e2(np.linspace(*LEVEL_BAND, 33))))
 

@@ -17,7 +17,7 @@ from lab.observables.dataset import Dataset, held_out_flats
 from lab.observables.flats.images import collect_rows
 from lab.observables.flats.row_light import ROW_LIGHT, nuisances, row_light_scatter
 from lab.observables.observable import Label, Measurement, Observable, Prediction
-from lab.observables.reads import ADDED, COLLECTED, GAINS, LEAK, LINE_GAINS, acting
+from lab.observables.reads import ADDED, COLLECTED, GAINS, LEAK, LINE_GAINS, TRAILS, acting
 from sim.camera import CameraModel
 from sim.effects.base import Effects
 from sim.point import even_share
@@ -108,7 +108,7 @@ def measure_flat_field(dataset: Dataset) -> Observable:
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures),
         p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
-        reads=SHADING | ADDED | COLLECTED | GAINS | LEAK | STRAYS | {"signal.response", "image.veils"},
+        reads=SHADING | ADDED | COLLECTED | GAINS | LEAK | STRAYS | TRAILS | {"signal.response", "image.veils"},
         scattered_by=ROW_LIGHT | LINE_GAINS,
         predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),
@@ -311,8 +311,15 @@ def _own_factors(
 ) -> list[FloatArray | float]:
     """Factor on the cells (cells,) of each plane by what tells its pixels from others."""
     model, collected = Uniform(dataset.camera, effects), _collected(dataset, effects)
-    strayed = {out: _strayed([p for p in planes if p.held_out == out], place, model) for out in (False, True)}
-    return [strayed[p.held_out].get(p.channel, 1.0) * collected.get(p.channel, 1.0) for p in planes]
+    of_frames = {out: [p for p in planes if p.held_out == out] for out in (False, True)}
+    strayed = {out: _strayed(part, place, model) for out, part in of_frames.items()}
+    trailed = {out: _trailed(part, model) for out, part in of_frames.items()}
+    return [
+        strayed[p.held_out].get(p.channel, 1.0)
+        * trailed[p.held_out].get(p.channel, 1.0)
+        * collected.get(p.channel, 1.0)
+        for p in planes
+    ]
 
 
 def _strayed(planes: Sequence[_ChannelCells], place: FieldPoints, model: Uniform) -> dict[str, FloatArray]:
@@ -322,6 +329,30 @@ def _strayed(planes: Sequence[_ChannelCells], place: FieldPoints, model: Uniform
         return {}
     after = model.stray_light({p.channel: p.level_e * np.ones(place.x_um.size) for p in planes}, place)
     return {p.channel: _cell_means(after[p.channel]) / p.level_e for p in planes}
+
+
+def _trailed(planes: Sequence[_ChannelCells], model: Uniform) -> dict[str, FloatArray]:
+    """Factor on the cells (cells,) of each channel by what packets leave behind on their way to the output: far from
+    it, neighbours of other channels collect more. `planes`: those of one set of frames."""
+    if not (model.trails and planes):
+        return {}
+    camera = model.camera
+    light = model.phases_of(model.light_of({p.channel: p.level_e for p in planes}))
+    step = mosaic.step(camera.cfa)
+    down, across = (
+        [_line_cells(comb[:, phase::step], count) for phase in range(step)]
+        for comb, count in zip(model.read_combs(), (ROWS, COLS), strict=True)
+    )
+    return {
+        channel: np.mean([down[r] @ light @ across[c].T for r, c in phases], axis=0).ravel()
+        for channel, phases in mosaic.phases(camera.cfa).items()
+    }
+
+
+def _line_cells(lines: FloatArray, count: int) -> FloatArray:
+    """Means (count, step) of values by line (step, lines) over a side's cells."""
+    edges = _edges(lines.shape[1], count)
+    return np.asarray(np.add.reduceat(lines, edges[:-1], axis=1) / np.diff(edges)).T
 
 
 def _collected(dataset: Dataset, effects: Effects) -> dict[str, FloatArray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,16 +11,24 @@ import numpy as np
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
 from lab.observables.dataset import Dataset
-from lab.observables.flats.images import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
+from lab.observables.flats.images import (
+    FlatLevel,
+    brightest_signal,
+    dark_level_dn,
+    flats,
+    green_lines,
+    green_planes,
+    green_ratio,
+)
 from lab.observables.noise.figures import BLACK_FLOOR_DN
 from lab.observables.observable import Label, Measurement, Observable, Prediction
-from lab.observables.reads import COLLECTED, LINE_GAINS, acting
+from lab.observables.reads import COLLECTED, LINE_GAINS, TRAILS, acting
 from sim.effects.base import Effects
 from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
-from sim.uniform import STRAYS, FieldPoints, Uniform
+from sim.uniform import STRAYS, FieldPoints, Uniform, phase_means
 
 GREEN_NOISE = 0.02  # ratios of a larger standard deviation aren't used
 CELLS = (3, 4)  # of the frame: rows, columns
@@ -90,19 +98,15 @@ def measure_green_balance(dataset: Dataset) -> Observable:
     cells = len(value) - len(ratios)
 
     def predict(effects: Effects) -> Prediction:
-        differing, moving = acting(effects, GREENS), acting(effects, KERNELS)
-        if moving:  # by how much depends on what the other colours hold
-            found = [_predicted_ratio(r, differing, dataset) for r in ratios]
-        else:
-            found = [_predicted_ratio(ratios[0], differing, dataset) if differing else 0.0] * len(ratios)
+        greens = _Greens(dataset, acting(effects, GREENS))
+        found, placed = greens.ratios(ratios), np.tile(greens.places() if cells else [], cells // number)
         model = Uniform(dataset.camera, effects)
-        placed = np.zeros(cells)
         if model.strays:
             parted = np.array([_parted(r, dataset, model) for r in ratios])
             found = [ratio + float(own.mean()) for ratio, own in zip(found, parted, strict=True)]
             flat = [r.x == 0.0 for r in ratios]  # none where only narrowband light is there, or every flat is noisy
             of_flats = parted[flat if any(flat) else slice(None)].mean(0)
-            placed = np.tile(of_flats - of_flats.mean(), cells // number)
+            placed = placed + np.tile(of_flats - of_flats.mean(), cells // number)
         return Prediction(np.concatenate([found, placed]), _line_gains(model, len(ratios), cells // number))
 
     return Observable(
@@ -200,18 +204,62 @@ def _by_wavelength(dataset: Dataset, rows_dn2: float) -> list[_Ratio]:
 
 #: Quantities of the stages by which neighbouring pixels differ in uniform light. A light that changes from row to row
 #: isn't among them: a green is held against the mean of the rows above and below.
-KERNELS = frozenset({"charge.kernels", "charge.trails"})
+KERNELS = TRAILS | {"charge.kernels"}
 GREENS = COLLECTED | KERNELS
 
 
-def _predicted_ratio(ratio: _Ratio, effects: Effects, dataset: Dataset) -> float:
-    """Return the ratio less 1 in a small uniform frame of the measured signals, with effects."""
-    shape = TILE_ROWS, TILE_COLS
-    electrons = {c: np.full(shape, max(m, 0.0) / dataset.noise.gain) for c, m in ratio.mean.items()}
-    tile = mosaic.assemble(electrons, dataset.camera.cfa)
-    tile = collected_mosaic(dataset.camera, tile, effects, exposure_s=ratio.exposure_s, elapsed_s=ratio.elapsed_s)
-    planes = mosaic.planes(tile, dataset.camera.cfa)
-    return float(planes["G1"].mean() / max(float(planes["G2"].mean()), 1e-9)) - 1.0
+class _Greens:
+    """The two greens in even light, as effects leave them."""
+
+    def __init__(self, dataset: Dataset, effects: Effects) -> None:
+        self._dataset, self._effects, self._model = dataset, effects, Uniform(dataset.camera, effects)
+        both = [green_lines(dataset.camera, axis, comb) for axis, comb in enumerate(self._model.read_combs())]
+        # of the greens on red rows, and of their neighbours: what each cell's lines read of those of a phase
+        self._down, self._across = (
+            [_line_cells(one, count) for one in pair] for pair, count in zip(both, CELLS, strict=True)
+        )
+        self._whole = [(down.mean(1), across.mean(1)) for down, across in zip(*both, strict=True)]
+
+    def ratios(self, ratios: Sequence[_Ratio]) -> list[float]:
+        """Return the greens' ratios less 1 over the frame, in light that is read with the ratios' mean signals."""
+        if not self._effects:
+            return [0.0] * len(ratios)
+        if acting(self._effects, KERNELS):  # by how much depends on what the other colours hold
+            return [self._ratio(one) for one in ratios]
+        return [self._ratio(ratios[0])] * len(ratios)
+
+    def _ratio(self, ratio: _Ratio) -> float:
+        light, cfa = self._light(ratio.mean), self._dataset.camera.cfa
+        if acting(self._effects, COLLECTED):
+            tile = mosaic.assemble({c: np.full((TILE_ROWS, TILE_COLS), e) for c, e in light.items()}, cfa)
+            tile = collected_mosaic(
+                self._dataset.camera, tile, self._effects, exposure_s=ratio.exposure_s, elapsed_s=ratio.elapsed_s
+            )
+            phases = phase_means(tile, cfa)
+        else:
+            phases = self._model.phases_of(light)
+        red, blue = (float(down @ phases @ across) for down, across in self._whole)
+        return red / max(blue, 1e-9) - 1.0
+
+    def places(self) -> FloatArray:
+        """Return the ratios of the cells over their mean, less 1 (cells,), in the light of flats."""
+        if not self._model.trails:
+            return np.zeros(CELLS[0] * CELLS[1])
+        phases = self._model.phases_of(self._light(brightest_signal(self._dataset)))
+        red, blue = (down @ phases @ across.T for down, across in zip(self._down, self._across, strict=True))
+        place = red / blue
+        return np.asarray(place / place.mean() - 1.0).ravel()
+
+    def _light(self, read: Mapping[str, float]) -> dict[str, float]:
+        """Electrons of the light of which these mean signals are read, DN."""
+        gain = self._dataset.noise.gain
+        return self._model.light_of({c: max(m, 0.0) / gain for c, m in read.items()})
+
+
+def _line_cells(lines: FloatArray, count: int) -> FloatArray:
+    """Means (count, step) of values by line (step, greens) over a side's cells."""
+    edges = np.linspace(0, lines.shape[1], count + 1).astype(int)
+    return np.asarray(np.add.reduceat(lines, edges[:-1], axis=1) / np.diff(edges)).T
 
 
 def _parted(ratio: _Ratio, dataset: Dataset, model: Uniform) -> FloatArray:

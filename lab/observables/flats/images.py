@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,6 +81,12 @@ def flats(dataset: Dataset) -> tuple[list[FlatLevel], dict[bool, tuple[FloatArra
     return sorted(levels, key=lambda u: sum(u.mean.values())), images
 
 
+def brightest_signal(dataset: Dataset) -> dict[str, float]:
+    """Return the mean signal of the brightest unclipped flats by channel, DN: the colour of the light."""
+    mean = dataset.once(flats)[0][-1].mean
+    return {c: float(np.mean([v for name, v in mean.items() if name[0] == c])) for c in dataset.channels}
+
+
 def dark_level_dn(dataset: Dataset, capture: Any) -> float:
     """Mean of a capture without light: black level + dark current x exposure, DN."""
     return dataset.noise.black + dataset.noise.dark_dn_per_s * float(capture.exposure_s)
@@ -111,6 +117,16 @@ def green_planes(dataset: Dataset, frame: Any) -> tuple[Any, Any]:
     return red_rows, 0.25 * (corners[0] + corners[1] + corners[2] + corners[3])
 
 
+def green_lines(camera: CameraModel, axis: int, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return what `green_planes` makes of a frame that is the product of values by row and by column: of values
+    (..., lines) along one axis, those of the greens on red rows, and of their neighbours, both (..., greens)."""
+    first = mosaic.phases(camera.cfa)["G"][0][axis]
+    first += 2 * (first == 0)
+    red, other = lines[..., first:-1:2], lines[..., first - 1 :: 2]
+    count = red.shape[-1]
+    return red, 0.5 * (other[..., :count] + other[..., 1 : count + 1])
+
+
 def green_ratio(dataset: Dataset, frame: Any) -> float:
     """Ratio of the two greens' means in a frame above the dark level, less 1, corrected for their difference in dark
     frames."""
@@ -119,13 +135,41 @@ def green_ratio(dataset: Dataset, frame: Any) -> float:
     return (float(red_rows.mean(dtype=float)) - dataset.once(_green_dark)) / below - 1.0
 
 
-def even_lines(camera: CameraModel, effects: Effects) -> tuple[FloatArray, FloatArray]:
-    """Return the means of the columns and of the rows of even light, each over its mean, as effects leave it."""
+def even_lines(
+    camera: CameraModel, effects: Effects, read: Mapping[str, float] | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return the means of the columns and of the rows of even light, each over its mean, as effects leave it, of a
+    frame whose planes are each over their means. `read`: mean signals by channel, for what packets leave behind on
+    their way to the output."""
     rows = collect_rows(camera, acting(effects, COLLECTED)).mean(axis=1)
-    gains = Uniform(camera, effects).gain_map()
+    cols = np.ones(camera.cols)
+    model = Uniform(camera, effects)
+    if model.trails and read is not None:
+        across, down = _trailed_lines(model, read)
+        rows, cols = rows * down, cols * across
+    gains = model.gain_map()
     if gains is None:
-        return np.ones(camera.cols), rows
-    return gains.mean(axis=0) / gains.mean(), rows * gains.mean(axis=1) / gains.mean()
+        return cols, rows
+    return cols * gains.mean(axis=0) / gains.mean(), rows * gains.mean(axis=1) / gains.mean()
+
+
+def _trailed_lines(model: Uniform, read: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
+    """Return the means of the columns and of the rows of even light, read with these means by channel, each plane of
+    the mosaic over its own."""
+    down, across = model.read_combs()
+    step, light = len(down), model.phases_of(model.light_of(read))
+    plane = np.array(
+        [
+            [float(down[:, i::step].mean(1) @ light @ across[:, j::step].mean(1)) for j in range(step)]
+            for i in range(step)
+        ]
+    )
+    rows, cols = np.zeros(down.shape[1]), np.zeros(across.shape[1])
+    for i in range(step):
+        for j in range(step):
+            rows[i::step] += down[:, i::step].T @ light @ across[:, j::step].mean(1) / plane[i, j] / step
+            cols[j::step] += down[:, i::step].mean(1) @ light @ across[:, j::step] / plane[i, j] / step
+    return cols, rows
 
 
 def collect_rows(camera: CameraModel, effects: Effects) -> FloatArray:

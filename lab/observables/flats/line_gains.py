@@ -14,10 +14,10 @@ from scipy.special import polygamma
 from lab.errors import NotDetermined
 from lab.observables.darks.readout import OFFSETS_STD, DarkReadOut, dark_readout
 from lab.observables.dataset import Dataset
-from lab.observables.flats.images import LEAST_SIGNAL, dark_level_dn, even_lines, flats
+from lab.observables.flats.images import LEAST_SIGNAL, brightest_signal, dark_level_dn, even_lines, flats
 from lab.observables.noise.line_spectra import log_mean_bias
 from lab.observables.observable import Label, Measurement, Observable, Prediction
-from lab.observables.reads import COLLECTED, GAINS, LINE_GAINS, acting
+from lab.observables.reads import COLLECTED, GAINS, LINE_GAINS, TRAILS, acting
 from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.sensor.lines import Lines
@@ -100,11 +100,12 @@ def measure_line_gains(dataset: Dataset) -> Observable:
         for name in ("power", "white", "shared", "shared_std", "offsets")
     )
     bands = len(BAND_EDGES) - 1
+    read = brightest_signal(dataset)
 
     def predict(effects: Effects) -> Prediction:
         model = Uniform(dataset.camera, effects)
-        still = acting(effects, COLLECTED | GAINS)
-        even = dict(zip(("columns", "rows"), even_lines(dataset.camera, still), strict=True)) if still else {}
+        still = acting(effects, COLLECTED | GAINS | TRAILS)
+        even = dict(zip(("columns", "rows"), even_lines(dataset.camera, still, read), strict=True)) if still else {}
         pattern = []
         for part in parts:
             variance = model.line_gain_std(part.lines) ** 2
@@ -120,7 +121,7 @@ def measure_line_gains(dataset: Dataset) -> Observable:
     return Observable(
         measurement=LINE_GAIN_POWER, reach=0.1, value=np.log(power / white) - bias, covariance=_covariance(parts),
         labels=tuple(Label(f, "all", part.lines, part.captures, part.held_out) for part in parts for f in _middles()),
-        reads=LINE_GAINS | COLLECTED | GAINS, predict=predict, scale=np.ones(len(bias)),
+        reads=LINE_GAINS | COLLECTED | GAINS | TRAILS, predict=predict, scale=np.ones(len(bias)),
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from lab.observables.reads import AMPLIFIERS
 from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.sensor.amplifiers import CoupledAmplifiers
-from sim.sensor.reading_order import OrderedNoise
+from sim.sensor.reading_order import ReadOutNoise
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
@@ -238,7 +238,7 @@ def _coupled(laws: Sequence[CoupledAmplifiers]) -> FloatArray:
     return np.array(found)
 
 
-def _ordered(noise: OrderedNoise, shape: tuple[int, int], period: int) -> FloatArray:
+def _ordered(noise: ReadOutNoise, shape: tuple[int, int], period: int) -> FloatArray:
     """Covariance by `RELATIONS` of noise in reading order, e^2, of one amplifier for all: along a row. Rows far apart
     have none."""
     found = np.zeros(len(RELATIONS))

@@ -18,7 +18,7 @@ from sim.camera import CameraModel, Cfa
 from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.sensor.electrons import NEIGHBOURS, solve_passed_share
-from sim.sensor.reading_order import OrderedNoise
+from sim.sensor.reading_order import ReadOutNoise
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
@@ -123,7 +123,7 @@ class OrderedCovariance:
     pixels: int
 
     @staticmethod
-    def of(noise: OrderedNoise, camera: CameraModel) -> OrderedCovariance:
+    def of(noise: ReadOutNoise, camera: CameraModel) -> OrderedCovariance:
         """Return the covariances in frames of a camera."""
         shape, period = (camera.rows, camera.cols), mosaic.step(camera.cfa)
         lags = [lag for every in PAIRS.values() for lag in every]

@@ -95,7 +95,7 @@ def test_a_gain_that_is_another_than_was_set_is_told(peer: AlpacaSimulator) -> N
     """The simulator counts from 0 when it is set, and from 1 when it is asked."""
     with (
         AlpacaCamera(peer.address, gain_db_per_unit=1.0, **peer.settings) as camera,
-        pytest.raises(InstrumentError, match="told a gain of 2 it says 3; its driver counts otherwise"),
+        pytest.raises(InstrumentError, match="a gain of 2 was set and 3 is read; its driver counts otherwise"),
     ):
         camera.configure(0.01, 2.0)
 

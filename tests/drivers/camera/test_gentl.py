@@ -91,7 +91,7 @@ def test_what_isnt_there_is_told_in_one_line(
     assert dict(GentlCamera.enumerate_cameras())["1"] == "Machine Vision Games Ltd. Viky 1"
     with pytest.raises(Disconnected, match="the GenTL producers find no such camera; there are: 0, 1, 2; is it"):
         GentlCamera("4711").connect()
-    with pytest.raises(InstrumentError, match="it has no TriggerMode, so that it can't be told when to expose"):
+    with pytest.raises(InstrumentError, match="it has no TriggerMode, so that its exposures can't be triggered"):
         GentlCamera(RED).connect()  # by its own description
     with pytest.raises(InstrumentError, match=r"none\.cti: it isn't a GenTL producer \(no such file\)"):
         GentlCamera(RED, producer=str(tmp_path / "none.cti")).connect()

@@ -99,7 +99,7 @@ def test_an_led_that_never_arrives_and_one_that_stays_lit_are_told(peer: LinePee
     lamp.set_level(0.5, "365")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mock, "_set", lambda groups: [mock._css()])
-        with pytest.raises(InstrumentError, match="told AXF000 channel A says SN050; look at it"):
+        with pytest.raises(InstrumentError, match="channel A was set to AXF000 and reads SN050; check the lamp"):
             lamp.set_level(0.0, "365")
         with pytest.raises(InstrumentError, match="it may be lit still: switch it off by hand"):
             lamp.close()

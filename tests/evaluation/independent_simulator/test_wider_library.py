@@ -11,6 +11,7 @@ import pytest
 from evaluation.draw import recordings_of
 from evaluation.independent_simulator import ConcealedCamera, Law, Plan
 from evaluation.independent_simulator.laws import (
+    AlternatingRowNoiseLaw,
     AmplifierCrosstalkLaw,
     BitWeightsLaw,
     ChargeTransferLaw,
@@ -44,6 +45,7 @@ STRONG: tuple[Law, ...] = (
     # three repeats of 192 rows tell 1/f from rows that are correlated over some in three of four draws; else the family
     ColouredLineNoiseLaw(5.0, 0, 11),
     ColouredLineNoiseLaw(5.0, 1, 9),
+    AlternatingRowNoiseLaw(1.5, 0, 9),
     PhaseDetectionRowsLaw(4.0, 0, 9),
     PhaseDetectionRowsLaw(4.0, 1, 9),
     PhaseDetectionRowsLaw(4.0, 2, 9),

@@ -506,7 +506,7 @@ def test_a_restore_that_failed_is_continued(
 
 
 def command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "lab.cli", *arguments]
+    return [sys.executable, "-m", "calibench", *arguments]
 
 
 def kill_when(process: subprocess.Popen[bytes], reached: Path, pattern: str) -> bool:

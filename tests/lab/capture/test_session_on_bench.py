@@ -45,7 +45,7 @@ FEW = CapturePlan(
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
     file = tmp_path / "station.toml"
-    command = [sys.executable, "-m", "lab.cli", "bench", "--station", str(file), "--with-parent"]
+    command = [sys.executable, "-m", "calibench", "bench", "--station", str(file), "--with-parent"]
     process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdin is not None
     assert process.stdout is not None

@@ -21,7 +21,7 @@ from lab.capture.store import Store
 from lab.capture_kinds.base import CAPTURES, SEQUENCES, TARGETS, AnyCapture, in_folder, names_in, registered
 from lab.cli.entry import main
 from lab.errors import InputError
-from lab.formats.importers import read_foreign
+from lab.foreign_recordings import read_foreign
 from lab.formats.recording_set import Manifest, inspect, read, write
 from lab.formats.results import CameraFit, DiagnosisResult, FitResult, ValidationResult
 from lab.report import provenance_of, write_report

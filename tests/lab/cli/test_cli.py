@@ -22,13 +22,13 @@ import sqlalchemy as sa
 
 import lab.diagnose
 import lab.fit
-from lab import cli
+from lab import bench_process, cli
 from lab.capture.by_hand import HandChange, LeftByHand
 from lab.capture.data_folder import open_store
 from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession
 from lab.capture_kinds.dark import DarkSequence
-from lab.cli import bench_process, capturing, diagnosis, entry, fitting
+from lab.cli import capturing, diagnosis, entry, fitting
 from lab.cli.console import EXIT_INPUT
 from lab.cli.help import help_and_example
 from lab.diagnose import Diagnosis
@@ -280,7 +280,7 @@ def test_a_result_is_on_disk_before_anything_is_printed(tmp_path: Path) -> None:
     file = tmp_path / "effects.json"
     read_end, write_end = os.pipe()
     os.close(read_end)
-    command = [sys.executable, "-m", "lab.cli", "effects", "--json", str(file)]
+    command = [sys.executable, "-m", "calibench", "effects", "--json", str(file)]
     ended = subprocess.run(command, stdout=write_end, stderr=subprocess.PIPE, check=False)
     os.close(write_end)
     assert ended.returncode != 0  # something was printed, and lost
@@ -520,7 +520,7 @@ def test_what_the_bench_refuses_is_passed_on(
     assert cli.main(["run", *(part for one in given for part in ("--conceal", one))]) == exit_code
     assert capsys.readouterr().err.splitlines() == [said]
     called = (tmp_path / "called").read_text().split()
-    assert called[:3] == ["-m", "lab.cli", "bench"]
+    assert called[:3] == ["-m", "calibench", "bench"]
     assert called[-2:] == [f"--conceal={one}" for one in given]
 
 
@@ -547,7 +547,7 @@ def test_import_writes_a_set_or_nothing(tmp_path: Path, flats: Path, capsys: pyt
 def test_the_command_itself(tmp_path: Path) -> None:
     """The real process: its exit code, its one line, and no traceback."""
     done = subprocess.run(
-        [sys.executable, "-m", "lab.cli", "fit", str(tmp_path / "nowhere")],
+        [sys.executable, "-m", "calibench", "fit", str(tmp_path / "nowhere")],
         capture_output=True,
         text=True,
         timeout=60,
@@ -937,7 +937,7 @@ def test_a_cluster_of_the_environment_is_left_where_nothing_is_spread(
 def test_sigterm_ends_a_command_and_the_bench_that_it_starts(tmp_path: Path) -> None:
     """The bench is being started: it would be there for half a minute where its loops are compiled. `--with-parent`
     tells whose it is."""
-    command = [sys.executable, "-m", "lab.cli", "run", "--quick", "--out", str(tmp_path / "data")]
+    command = [sys.executable, "-m", "calibench", "run", "--quick", "--out", str(tmp_path / "data")]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     children: list[psutil.Process] = []
     while not children and process.poll() is None:

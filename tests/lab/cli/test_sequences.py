@@ -37,7 +37,7 @@ def test_a_station_is_told_its_captures_and_time(
     }  # fmt: skip
     assert main([*asked, "--quick"]) == 0
     told = capsys.readouterr().out
-    assert "32 captures in 16 steps, perhaps" in told and "0.0005, 0.5, 2, 5" in told
+    assert "32 captures in 16 steps, about" in told and "0.0005, 0.5, 2, 5" in told
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.dataset import Dataset
 from lab.observables.gaussian import chi2
 from lab.observables.observable import Measurement, Observable
-from sim.camera import CameraModel, Lens
+from sim.camera import CameraModel, Cfa, Lens
 from sim.effects.base import Effect
 from sim.frame import Exposure, sample
 from sim.scene.scenes import Darkness, UniformField
@@ -70,21 +70,27 @@ def sigmas(found: MeasurementModel, effects: Sequence[Effect] = ()) -> float:
     return (chi2(found.value - gaussian.mean, gaussian.covariance) - n) / float(np.sqrt(2.0 * n))
 
 
-def rendered(seed: int, effects: Sequence[Effect] = (), *, sweep_to_nm: int = 0, repeats: int = 3) -> RecordingSet:
+def rendered(
+    seed: int, effects: Sequence[Effect] = (), *, sweep_to_nm: int = 0, repeats: int = 3, cfa: Cfa = "MONO"
+) -> RecordingSet:
     """A session that `sim` takes: darks, flats at eight levels, a sweep from 400 nm where `sweep_to_nm` says how
     far."""
     wavelength = np.arange(380.0, max(781.0, sweep_to_nm + 41.0))
-    efficiency = Spectrum.of(wavelength, 0.5 * np.exp(-0.5 * ((wavelength - 540.0) / 140.0) ** 2))
+    curves = {"Y": (540.0, 140.0)} if cfa == "MONO" else {"R": (610.0, 40.0), "G": (540.0, 40.0), "B": (460.0, 35.0)}
+    efficiency = {
+        channel: Spectrum.of(wavelength, 0.5 * np.exp(-0.5 * ((wavelength - middle) / width) ** 2))
+        for channel, (middle, width) in curves.items()
+    }
     camera = CameraModel(
-        rows=96, cols=128, pixel_pitch_um=3.0, fill_factor=0.9, cfa="MONO", bit_depth=12, black_level_dn=128.0,
+        rows=96, cols=128, pixel_pitch_um=3.0, fill_factor=0.9, cfa=cfa, bit_depth=12, black_level_dn=128.0,
         white_level_dn=4095.0,
         conversion_gain_dn_per_e=0.4, full_well_e=9900.0, read_noise_e=3.0, dark_current_e_per_s=5.0, dsnu_e=0.0,
         prnu_percent=0.0,
-        quantum_efficiency={"Y": efficiency}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
+        quantum_efficiency=efficiency, lens=Lens(f_number=4.0, focal_length_mm=8.0),
     )  # fmt: skip
     rng = np.random.default_rng(seed)
     frames: dict[str, np.ndarray] = {}
-    spectra = {"qe.csv": efficiency}
+    spectra = {f"qe-{channel}.csv": curve for channel, curve in efficiency.items()}
     captures: list[dict[str, object]] = []
 
     def take(kind: str, light: Spectrum | None, exposure_s: float, count: int, **more: object) -> None:
@@ -109,19 +115,20 @@ def rendered(seed: int, effects: Sequence[Effect] = (), *, sweep_to_nm: int = 0,
         take("dark", None, t, 3)
     lamp = Spectrum.of(wavelength, np.full(wavelength.shape, 0.02))
     spectra["lamp.csv"] = lamp
-    full_s = camera.full_well_e / electron_rate(camera, "Y", lamp)
+    full_s = camera.full_well_e / max(electron_rate(camera, channel, lamp) for channel in camera.channels)
     for level in (0.05, 0.12, 0.22, 0.35, 0.5, 0.65, 0.8, 0.92):
         take("flat", lamp, round(level * full_s, 7), repeats, radiance="lamp.csv")
     for w in range(400, sweep_to_nm + 1, 10):
         line = Spectrum.of(wavelength, 0.004 * np.exp(-0.5 * ((wavelength - w) / 4.2466) ** 2))
         spectra[f"{w}.csv"] = line
-        exposure = 0.7 * camera.full_well_e / max(electron_rate(camera, "Y", line), 1e4)
+        fastest = max(electron_rate(camera, channel, line) for channel in camera.channels)
+        exposure = 0.7 * camera.full_well_e / max(fastest, 1e4)
         take("narrowband", line, round(exposure, 6), 1, wavelength_nm=w, bandwidth_nm=10, radiance=f"{w}.csv")
     stated = {
-        "rows": 96, "cols": 128, "pixel_pitch_um": 3.0, "fill_factor": 0.9, "cfa": "MONO", "bit_depth": 12,
+        "rows": 96, "cols": 128, "pixel_pitch_um": 3.0, "fill_factor": 0.9, "cfa": cfa, "bit_depth": 12,
         "black_level_dn": 128.0,
         "white_level_dn": 4095.0, "f_number": 4.0, "focal_length_mm": 8.0, "lens_transmittance": 1.0,
-        "quantum_efficiency": {"Y": "qe.csv"},
+        "quantum_efficiency": {channel: f"qe-{channel}.csv" for channel in efficiency},
     }  # fmt: skip
     manifest = Manifest.model_validate({"name": "sim", "cameras": {"left": stated}, "captures": captures})
     return RecordingSet(manifest, frames, spectra, source="sim")

@@ -41,7 +41,8 @@ from lab.diagnose.discovery.profile import Profile, curve_forms, description_len
 from lab.diagnose.inference.side_model import dataset_of
 from lab.diagnose.policy import DecisionPolicy
 from lab.fit import FOR_DIAGNOSIS, fit_recording_set
-from lab.formats.importers import ImportOptions, read_foreign
+from lab.foreign_recordings import read_foreign
+from lab.formats.importers import ImportOptions
 from lab.formats.recording_set import RecordingSet, read, write
 from sim.effects.column_noise import ColumnNoise
 

@@ -13,7 +13,7 @@ from evaluation.draw import recordings_of
 from evaluation.independent_simulator import ConcealedCamera, Plan
 from evaluation.independent_simulator import laws as concealed_laws
 from lab.diagnose import diagnose, examine
-from lab.formats.importers import read_foreign
+from lab.foreign_recordings import read_foreign
 from lab.formats.recording_set import inspect
 
 ROOT = Path(__file__).parents[3]

@@ -9,9 +9,9 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 from scipy.stats import t as student_t
 
-from lab.inference.hypotheses import Coordinate, SetPrior
+from lab.inference.hypotheses import Alternative, Coordinate, Hypothesis, SetPrior
 from lab.inference.laplace import integrate, log_box
-from lab.inference.model import Group, ScaleIntegral
+from lab.inference.model import Group, Point, ScaleIntegral
 from lab.inference.search import ANY_UNLISTED, Search
 from sim.spectrum import FloatArray
 from tests.lab.inference.toys import Toy, linear, shaped
@@ -188,3 +188,32 @@ def test_probabilities_of_an_effect_that_is_hardly_seen_are_those_of_quadrature(
             away.append(float(np.log(p / (1.0 - p)) - exact))
     assert len(away) > 8
     assert np.abs(away).max() < 0.1
+
+
+def test_a_rival_that_bends_is_refitted_before_it_is_ruled_out() -> None:
+    """Two changes that are the same but for the bend of one by its size: the closed form about nothing, which scales
+    its signature, gives it a seventh of the other's probability."""
+    along, bend = np.zeros(40), np.zeros(40)
+    along[0], bend[1] = 10.0, 2.3
+
+    def straight(u: np.ndarray) -> np.ndarray:
+        return u[0] * along
+
+    def bent(u: np.ndarray) -> np.ndarray:
+        return u[0] * along + (u[0] ** 2 - u[0]) * bend
+
+    value = straight(np.array([1.0]))
+    hypotheses = {
+        "straight": Hypothesis("straight", "a", (Coordinate("size", 1.0, lower=0.0),), _prototype(1.0)),
+        "bent": Hypothesis("bent", "a", (Coordinate("size", 1.0, lower=0.0),), _prototype(3.0)),
+    }
+    toy = Toy(value, {"straight": straight, "bent": bent}, np.zeros((40, 0)))
+    search = Search(toy, hypotheses, SetPrior(dict.fromkeys(hypotheses, "a")))
+    table = search.run()
+    either = {name: sum(r.probability for r in table.rows if name in r.members) for name in hypotheses}
+    # at size 1 both predict the same; the integrals over the size differ by its bend, a few per cent
+    assert either["bent"] / either["straight"] == pytest.approx(1.0, abs=0.2)
+
+
+def _prototype(size: float) -> tuple[Alternative, ...]:
+    return (Alternative((Point(np.array([size])),), (1.0 / size,)),)

@@ -105,7 +105,7 @@ def test_tables_and_pictures_are_ready_for_the_page() -> None:
     )
     made = context(RESULT.model_copy(update={"visibility": (seen, shape), "pictures": (picture,)}), ("left", "right"))
     assert made["visibility"]["defocus"]["right"].smallest == "defocus 2.3 µm"
-    assert made["visibility"]["infrared_cut_filter"]["right"].smallest == "not a matter of size"
+    assert made["visibility"]["infrared_cut_filter"]["right"].smallest == "detectable at any magnitude"
     assert (made["residual_pictures"][0].rms_before, made["residual_pictures"][0].rms_after) == ("3.00", "1.00")
     assert made["residual_pictures"][0].before.startswith("data:image/png;base64,")
     assert context(None, ("left",)) == {}

@@ -18,10 +18,10 @@ from lab.report.geometry import (
     charts_by_side,
     coverage,
     depth_map,
+    draw_rectified,
     facts,
     lateral_colour,
     projection_map,
-    rectified_picture,
     residual_vectors,
 )
 from tests.lab.fit.projected import SHAPE, poses, seen
@@ -107,8 +107,8 @@ def test_rectified_pair_is_one_picture_of_both(rig):
         Manifest(cameras={"left": camera, "right": camera}, captures=tuple(captures)),
         frames={c.frame: frame for c in captures},
     )
-    uri, pose = rectified_picture(recordings, stereo)
+    uri, pose = draw_rectified(recordings, stereo)
     assert pose in {capture.pose for capture in captures}
     picture = cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape == (round(1200 * SHAPE[0] / (2 * SHAPE[1])), 1200, 3)
-    assert rectified_picture(recordings, stereo.model_copy(update={"rectification": None})) is None
+    assert draw_rectified(recordings, stereo.model_copy(update={"rectification": None})) is None

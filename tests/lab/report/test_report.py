@@ -47,7 +47,7 @@ from lab.report.pictures import (
     kernel_picture,
     patch_colours,
     png_data_uri,
-    trimmed_margin,
+    trim_margin,
 )
 
 MadeUp = Callable[..., Any]
@@ -444,8 +444,8 @@ def test_frame_picture_puts_the_mosaic_channels_where_they_belong() -> None:
 def test_border_that_holds_nothing_is_cut_off() -> None:
     kernel = np.zeros((21, 21))
     kernel[10, 10], kernel[10, 14] = 1.0, 0.1
-    assert trimmed_margin([kernel]) == 6
-    assert trimmed_margin([np.ones((9, 9))]) == 0
+    assert trim_margin([kernel]) == 6
+    assert trim_margin([np.ones((9, 9))]) == 0
 
 
 def test_patch_colours_are_balanced_on_the_measured_white() -> None:

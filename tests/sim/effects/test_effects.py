@@ -16,8 +16,8 @@ from sim.effect_contract import (
     LINE,
     LINE_650,
     PLACE_UM,
-    absent_complaints,
-    declared_complaints,
+    check_absence,
+    check_declarations,
     prototype_complaints,
     slope_complaints,
 )
@@ -54,12 +54,12 @@ def _transfer(
 
 @pytest.mark.parametrize("kind", ALL, ids=lambda k: k.name)
 def test_absent_is_the_baseline_exactly(kind: type[Effect]) -> None:
-    assert list(absent_complaints(kind)) == []
+    assert list(check_absence(kind)) == []
 
 
 @pytest.mark.parametrize("kind", ALL, ids=lambda k: k.name)
 def test_declares_what_the_diagnosis_reads(kind: type[Effect]) -> None:
-    assert list(declared_complaints(kind)) == []
+    assert list(check_declarations(kind)) == []
     assert kind.name == kind.__module__.rsplit(".", 1)[-1]  # one effect, one file
     # a known part of a camera, the diagnosis' own term for what has no name, and a misstated f-number
     assert kind.is_candidate == (

@@ -8,7 +8,7 @@ from scipy.signal import convolve2d
 
 from sim.effects.brighter_fatter import BrighterFatter
 from sim.effects.inter_pixel_capacitance import InterPixelCapacitance
-from sim.sensor.electrons import NEIGHBOURS, passed_shares, shared_departures, solve_passed_share
+from sim.sensor.electrons import NEIGHBOURS, interpolate_passed_shares, share_departures, solve_passed_share
 from sim.stages import charge_of
 from tests.sim.effects.test_sensor_effects import CAMERA
 
@@ -83,7 +83,7 @@ def test_drawn_departures_have_these_correlations_and_keep_their_variance() -> N
     charge = charge_of(CAMERA, (one,))
     mean = np.full((SIDE, SIDE), 0.8 * CAMERA.full_well_e)
     white = np.sqrt(mean) * np.random.default_rng(3).standard_normal(mean.shape)
-    drawn = shared_departures(white, mean, passed_shares(charge.neighbour_correlation, mean))
+    drawn = share_departures(white, mean, interpolate_passed_shares(charge.neighbour_correlation, mean))
     variance = drawn.var()
     assert variance == pytest.approx(mean[0, 0], rel=4.0 * 1.4e-3)
     stated = charge.neighbour_correlation(mean[0, 0])

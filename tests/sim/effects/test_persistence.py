@@ -9,7 +9,7 @@ import pytest
 
 from sim.effects.image_lag import ImageLag
 from sim.effects.persistence import Persistence
-from sim.frame import Exposure, expected_electrons, expected_sequence
+from sim.frame import Exposure, expect_sequence, expected_electrons
 from sim.scene.scenes import Darkness, UniformField
 from sim.stages import charge_of
 from sim.uniform import Uniform
@@ -29,7 +29,7 @@ SERIES = [
 def test_every_frame_before_leaves_its_own_decay() -> None:
     """The sum over all frames before, which a recursion replaces in the code: exact but for rounding."""
     q, tau_s = 0.04, 12.0
-    found = [e[10, 10] for e in expected_sequence(CAMERA, SERIES, (Persistence(share_percent=4.0, release_s=tau_s),))]
+    found = [e[10, 10] for e in expect_sequence(CAMERA, SERIES, (Persistence(share_percent=4.0, release_s=tau_s),))]
     read: list[float] = []
     for k, one in enumerate(SERIES):
         total = float(expected_electrons(CAMERA, one)[10, 10])
@@ -43,7 +43,7 @@ def test_every_frame_before_leaves_its_own_decay() -> None:
 
 def test_levels_are_those_of_frames() -> None:
     acting = (Persistence(share_percent=4.0, release_s=12.0),)
-    frames = [e[10, 10] for e in expected_sequence(CAMERA, SERIES, acting)]
+    frames = [e[10, 10] for e in expect_sequence(CAMERA, SERIES, acting)]
     own = [float(expected_electrons(CAMERA, one)[10, 10]) for one in SERIES]
     begin_s, exposure_s = (np.array([getattr(one, name) for one in SERIES]) for name in ("elapsed_s", "exposure_s"))
     released = Uniform(CAMERA, acting).released_e(begin_s, exposure_s, np.array(frames)[:, None])[:, 0]
@@ -53,13 +53,13 @@ def test_levels_are_those_of_frames() -> None:
 def test_traps_take_no_more_than_the_full_well() -> None:
     """What overflows isn't trapped, and a frame that has no time comes directly after."""
     flood = Exposure(UniformField(LIGHT.scale(100.0)), 1.0)
-    _, after = expected_sequence(CAMERA, [flood, DARK], (Persistence(share_percent=10.0, release_s=2.0),))
+    _, after = expect_sequence(CAMERA, [flood, DARK], (Persistence(share_percent=10.0, release_s=2.0),))
     own = float(expected_electrons(CAMERA, DARK)[0, 0])
     assert after[0, 0] == pytest.approx(own + 0.1 * CAMERA.full_well_e * (1.0 - np.exp(-1.0)))
 
 
 def _sequence(*acting: Persistence | ImageLag) -> list[float]:
-    return [float(e[10, 10]) for e in expected_sequence(CAMERA, SERIES, acting)]
+    return [float(e[10, 10]) for e in expect_sequence(CAMERA, SERIES, acting)]
 
 
 def test_two_kinds_are_two_effects() -> None:

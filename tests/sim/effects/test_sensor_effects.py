@@ -26,8 +26,8 @@ from sim.frame import (
     Exposure,
     collected_mosaic,
     dark_electrons,
+    expect_sequence,
     expected_electrons,
-    expected_sequence,
     moments,
     predict_frame,
     sample,
@@ -145,7 +145,7 @@ def test_dark_current_doubles_with_the_temperature() -> None:
 def test_lag_leaves_powers_of_its_share_and_loses_nothing() -> None:
     q = 0.08
     exposures = [BRIGHT, BRIGHT, BRIGHT, DARK, DARK, DARK]
-    read = [float(e[10, 10]) for e in expected_sequence(CAMERA, exposures, (ImageLag(lag_percent=8.0),))]
+    read = [float(e[10, 10]) for e in expect_sequence(CAMERA, exposures, (ImageLag(lag_percent=8.0),))]
     bright, dark = (float(expected_electrons(CAMERA, exposure)[10, 10]) for exposure in (BRIGHT, DARK))
     # the k-th of equal frames: 1 - q^k of it; the k-th dark frame after them: what is left of it, and its own
     for k in (1, 2, 3):
@@ -157,14 +157,14 @@ def test_lag_leaves_powers_of_its_share_and_loses_nothing() -> None:
     kept = (sum([bright] * 3 + [dark] * 3) - sum(read)) / q * (1 - q)
     assert read[-1] == pytest.approx(kept)
     # without lag a sequence is its frames
-    for frame, exposure in zip(expected_sequence(CAMERA, exposures), exposures, strict=True):
+    for frame, exposure in zip(expect_sequence(CAMERA, exposures), exposures, strict=True):
         np.testing.assert_array_equal(frame, expected_electrons(CAMERA, exposure))
 
 
 def test_lag_keeps_to_the_full_well() -> None:
     """What overflows isn't left behind."""
     flood = Exposure(UniformField(LIGHT.scale(100.0)), 1.0)
-    _, after = expected_sequence(CAMERA, [flood, DARK], (ImageLag(lag_percent=2.0),))
+    _, after = expect_sequence(CAMERA, [flood, DARK], (ImageLag(lag_percent=2.0),))
     assert after[0, 0] == pytest.approx((5.0 + 0.02 * 7500.0) * 0.98)
 
 
@@ -172,7 +172,7 @@ def test_frames_of_a_sequence_are_drawn_around_its_means() -> None:
     lag = (ImageLag(lag_percent=5.0),)
     exposures = [BRIGHT, DARK] * FRAMES
     frames = np.stack(list(sample_sequence(CAMERA, exposures, np.random.default_rng(43), lag)))[3::2].astype(float)
-    means = list(expected_sequence(CAMERA, exposures[:20], lag))
+    means = list(expect_sequence(CAMERA, exposures[:20], lag))
     dark = means[-1]
     wanted = 100.0 + 0.5 * dark
     variance = 0.25 * (dark + 4.0) + 1 / 12

@@ -13,7 +13,7 @@ from sim.optics.diffraction import diffraction_otf
 from sim.optics.planewaves import interpolate_rays, point_spread
 from sim.optics.prescription import Aperture, GlassName, Prescription, PrescriptionError, Surface
 from sim.optics.system import OpticalSystem
-from sim.optics.traced_table import OpticalTable, TableSettings, cached_table, lens_table
+from sim.optics.traced_table import OpticalTable, TableSettings, lens_table, read_or_trace_table
 from sim.optics.zmx import read_zmx
 
 HERE = Path(__file__).parent
@@ -415,13 +415,13 @@ def test_a_lens_that_makes_no_image_is_refused(prescription: Prescription, said:
 
 def test_a_damaged_cache_is_computed_again(tmp_path: Path) -> None:
     settings = TableSettings(wavelength_nm=(550.0,), fields=2, samples=8)
-    table = cached_table(doublet(), tmp_path, settings)
+    table = read_or_trace_table(doublet(), tmp_path, settings)
     file = tmp_path / f"{table.content_hash}.npz"
     data = file.read_bytes()
     file.write_bytes(data[: len(data) // 2])
-    again = cached_table(doublet(), tmp_path, settings)
+    again = read_or_trace_table(doublet(), tmp_path, settings)
     assert np.array_equal(again.psf, table.psf) and file.read_bytes()[: len(data) // 2] == data[: len(data) // 2]
-    other = cached_table(doublet(), tmp_path, settings.model_copy(update={"samples": 10}))
+    other = read_or_trace_table(doublet(), tmp_path, settings.model_copy(update={"samples": 10}))
     assert other.content_hash != table.content_hash and other != table
 
 

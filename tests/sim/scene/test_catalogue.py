@@ -227,7 +227,7 @@ def test_a_rig_without_geometry_is_refused(mono_camera: CameraModel) -> None:
 
 
 def test_the_documentation_lists_every_scene_and_parameter() -> None:
-    text = (Path(__file__).parents[3] / "docs" / "reference" / "scenes.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs" / "reference" / "scene-parameters.md").read_text(encoding="utf-8")
     for item in (*SCENES.values(), PictureOnScreen, Cube):
         section = text.split(f"**`{item.name}`**: {item.shows}.")[1].split("**`")[0]
         for field, quantity in item.quantities().items():

@@ -11,10 +11,10 @@ from sim.sensor import mosaic
 from sim.sensor.electrons import (
     FixedPattern,
     ReadOut,
-    clipped_moments,
-    coded_moments,
+    clip_moments,
     dark_current_e_per_s,
     dn_moments,
+    encode_moments,
     gain_dn_per_e,
     sample_from,
 )
@@ -26,14 +26,14 @@ def test_moments_of_a_clipped_normal_variable(lower: float, upper: float) -> Non
     z = stats.norm(0.3, 1.7)
     x = np.linspace(0.3 - 12 * 1.7, 0.3 + 12 * 1.7, 400_001)
     weight, clipped = z.pdf(x) * (x[1] - x[0]), np.clip(x, lower, upper)
-    mean, variance = clipped_moments(np.array([0.3]), np.array([1.7**2]), lower, upper)
+    mean, variance = clip_moments(np.array([0.3]), np.array([1.7**2]), lower, upper)
     # A sum at steps of 1e-4 with kinks at the limits errs by about the step squared.
     assert mean[0] == pytest.approx(weight @ clipped, abs=1e-7)
     assert variance[0] == pytest.approx(weight @ clipped**2 - (weight @ clipped) ** 2, abs=1e-6)
 
 
 def test_far_from_the_limits_nothing_changes_to_the_last_bit() -> None:
-    mean, variance = clipped_moments(np.array([500.1]), np.array([33.3]), 0.0, 4095.0)
+    mean, variance = clip_moments(np.array([500.1]), np.array([33.3]), 0.0, 4095.0)
     assert (mean[0], variance[0]) == (500.1, 33.3)
 
 
@@ -45,14 +45,14 @@ def test_moments_of_codes(mean: float, sigma: float) -> None:
     up_to = stats.norm(mean, sigma).cdf(codes + 0.5)
     up_to[-1] = 1.0
     share = np.diff(up_to, prepend=0.0)
-    found_mean, found_variance = coded_moments(np.array([mean]), np.array([sigma**2]), 20.0)
+    found_mean, found_variance = encode_moments(np.array([mean]), np.array([sigma**2]), 20.0)
     # 1e-3 DN at a limit is what the two terms of Euler and Maclaurin leave.
     assert found_mean[0] == pytest.approx(share @ codes, abs=1e-3)
     assert found_variance[0] == pytest.approx(share @ codes**2 - (share @ codes) ** 2, abs=2e-3)
 
 
 def test_wide_noise_is_rounded_for_a_twelfth() -> None:
-    mean, variance = coded_moments(np.array([100.3]), np.array([2.0]), 4095.0)
+    mean, variance = encode_moments(np.array([100.3]), np.array([2.0]), 4095.0)
     assert (mean[0], variance[0]) == (100.3, 2.0 + 1.0 / 12.0)
 
 

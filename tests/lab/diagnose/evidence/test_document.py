@@ -11,15 +11,16 @@ import pytest
 import lab.inference.recordings
 from evaluation.draw import recordings_of
 from evaluation.independent_simulator import LISTED, WHOLE_SESSION, ConcealedCamera, Law
-from lab.diagnose import Diagnosis, examine
+from lab.diagnose import Diagnosis, _as_given, examine
 from lab.diagnose.evidence import doubt
 from lab.diagnose.outcome.expected_information import entropy, expected_information
 from lab.diagnose.outcome.next_capture import NOTHING, WITH
 from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import DiagnosisResult
+from lab.formats.results import CameraFit, DiagnosisResult, FitResult
 from lab.inference.check import held_out_ids
 from lab.inference.posterior import LIKELIER, NAMED
+from lab.inference.statements.statement import restated_camera
 from sim.effects.library import effect
 
 PLAN = replace(WHOLE_SESSION, kinds=("dark", "flat"))
@@ -179,6 +180,15 @@ def test_a_camera_without_effects_has_no_mismatch(few_hypotheses: None) -> None:
     assert not found.result.mismatches
     assert not found.improved["left"].effects
     assert found.result.false_alarm_rate == pytest.approx(0.01)
+
+
+def test_a_fit_that_mixed_the_planes_of_a_wrong_mosaic_is_no_baseline() -> None:
+    """Of a fit that is given, the cameras whose stated mosaic was corrected are left out."""
+    recordings = _recordings()
+    fit = FitResult(source="made up", cameras={"left": CameraFit()})
+    assert _as_given(fit, recordings.manifest, recordings) == fit
+    restated = restated_camera(recordings, "left", cfa="RGGB", quantum_efficiency=None)
+    assert _as_given(fit, recordings.manifest, restated).cameras == {}
 
 
 def test_an_engine_takes_what_is_its_own() -> None:

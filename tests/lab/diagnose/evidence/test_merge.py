@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.special import expit, logit
 
 from lab.diagnose.evidence.causes import Cause
-from lab.diagnose.evidence.merge import joint_probability, merged_evidence
-from lab.diagnose.evidence.side import EvidenceFindings
+from lab.diagnose.evidence.merge import joint_moments, joint_probability, merged_evidence, told_by_all
+from lab.diagnose.evidence.side import EvidenceFindings, SetRow
 from lab.diagnose.evidence.side_table import SideTable
 from lab.diagnose.outcome.expected_information import Forecast, settling_probability
 from lab.diagnose.outcome.next_capture import NOTHING, next_sentence
 from lab.diagnose.policy import DEFAULT_POLICY
 from lab.formats.results import DiagnosisLists, NextCapture
-from lab.inference.hypotheses import SetPrior
+from lab.inference.hypotheses import Coordinate, SetPrior
 from lab.inference.posterior import Size
 from sim.camera import Side
 from sim.effects.axial_chromatic_aberration import AxialChromaticAberration
@@ -28,12 +29,12 @@ PRIOR = 0.01
 
 
 def _cause(effect: Effect, probability: float, size: float, std: float, parameter: str) -> Cause:
-    """Return a cause of one size, of a prior N(0, 1) that is flat over its posterior."""
+    """Return a cause of one size, of a prior that is Student's t of scale 1."""
     return Cause(
         name=effect.name, effect=effect, probability=probability, prior=PRIOR,
         sizes=(Size(parameter, size, std, (size - 2.0 * std, size + 2.0 * std), True),),
         mean=np.array([size]), covariance=np.array([[std**2]]), inexact=0.0, shown_in=("dark",),
-        log_prior_density=-0.5 * float(np.log(2.0 * np.pi)),
+        coordinates=(Coordinate(parameter, 1.0),),
     )  # fmt: skip
 
 
@@ -60,15 +61,39 @@ def test_a_side_that_says_nothing_leaves_the_others_probability() -> None:
 
 
 def test_sides_that_agree_multiply_their_bayes_factors() -> None:
-    """Odds: prior times both factors times c = N(0; 0, 2 s^2) / N(0; 0, 1) of equal sizes and a flat prior density."""
+    """Odds: prior times both factors times c = N(0; 0, 2 s^2) / p(0.5) of equal sizes: p is nearly linear over their
+    posterior, whose standard deviation is 0.07, and curved by some 1e-3 of itself there."""
     causes = [_drift(0.8), _drift(0.7)]
     factors = (logit(0.8) - logit(PRIOR)) + (logit(0.7) - logit(PRIOR))
-    agreement = -0.5 * np.log(2.0 * np.pi * 2.0 * 0.1**2) + 0.5 * np.log(2.0 * np.pi)
+    agreement = -0.5 * np.log(2.0 * np.pi * 2.0 * 0.1**2) - float(Coordinate("size", 1.0).log_prior(0.5))
     expected = expit(logit(PRIOR) + factors + agreement)
-    assert joint_probability("source_drift", _pair(causes), causes) == pytest.approx(float(expected))
+    found = joint_probability("source_drift", _pair(causes), causes)
+    assert logit(found) == pytest.approx(logit(expected), abs=0.02)
     (named,) = merged_evidence("made up", _pair(causes)).effects
     assert named.sides == ("left", "right")
-    assert named.probability == pytest.approx(float(expected))
+    assert named.probability == found
+
+
+def test_a_side_that_learns_nothing_of_a_shape_agrees_with_any() -> None:
+    """A normal prior, and one side whose posterior is that prior: p(u | y_1) p(u) / p(u) has the integral 1. The mean
+    of 1 / p over the joint fit varies as a lognormal number of sigma^2 below 0.1: 3 sqrt(0.1 / 2000) = 0.02."""
+    told, quiet = _drift(0.9, 0.3, 0.1), _drift(0.9, 0.0, 1.0)
+    shape = (Coordinate("drift_percent_per_min", 1.0, is_shape=True),)
+    causes = [replace(told, coordinates=shape), replace(quiet, coordinates=shape)]
+    factors = 2.0 * (logit(0.9) - logit(PRIOR))
+    found = joint_probability("source_drift", _pair(causes), causes)
+    assert logit(found) == pytest.approx(logit(PRIOR) + factors, abs=0.02)
+
+
+def test_a_joint_fit_has_the_precision_of_both_sides() -> None:
+    """Precisions add; means are weighed by them."""
+    rng = np.random.default_rng(2)
+    covariances = [a @ a.T + 0.1 * np.eye(3) for a in rng.standard_normal((2, 3, 3))]
+    means = rng.standard_normal((2, 3))
+    mean, covariance = joint_moments(means[0], covariances[0], means[1], covariances[1])
+    precisions = [np.linalg.inv(c) for c in covariances]
+    np.testing.assert_allclose(np.linalg.inv(covariance), precisions[0] + precisions[1], rtol=1e-6)
+    np.testing.assert_allclose(mean, covariance @ (precisions[0] @ means[0] + precisions[1] @ means[1]), rtol=1e-6)
 
 
 def test_sides_that_contradict_each_other_name_no_common_cause() -> None:
@@ -78,6 +103,37 @@ def test_sides_that_contradict_each_other_name_no_common_cause() -> None:
     result = merged_evidence("made up", _pair(causes))
     assert not result.effects
     assert result.verdict == "unexplained"
+
+
+def test_a_rival_of_what_both_sides_share_falls_with_what_the_other_side_says() -> None:
+    """Left: the lamp's drift or a defocus, one of the two, equally probable. Right: the drift, nearly surely. Given
+    both, the drift has p, and the defocus, which is in all of left's other sets, 1 - p."""
+    drift, defocus = _drift(0.5), _cause(Defocus(defocus_um=3.0), 0.5, 3.0, 0.1, "defocus_um")
+    left = replace(
+        _side("left", drift), causes=(drift, defocus),
+        rows=(
+            SetRow(frozenset({"source_drift"}), frozenset(), 0.5),
+            SetRow(frozenset({"defocus"}), frozenset({"response"}), 0.5),
+        ),
+        calm=True,
+    )  # fmt: skip
+    sure = _drift(0.9999)
+    right = replace(
+        _side("right", sure), rows=(SetRow(frozenset({"source_drift"}), frozenset(), 1.0),)
+    )  # of one set: nothing to reweigh
+    p = joint_probability("source_drift", (left, right), [drift, sure])
+    assert p > 0.99
+    told, other = told_by_all((left, right))
+    assert {c.name: c.probability for c in told.causes} == pytest.approx({"source_drift": 0.5, "defocus": 1.0 - p})
+    assert told.calm
+    assert other == right
+    (named,) = merged_evidence("made up", (left, right)).effects
+    assert (named.name, named.sides, named.probability) == ("source_drift", ("left", "right"), pytest.approx(p))
+
+
+def test_one_side_tells_what_it_tells() -> None:
+    alone = replace(_side("left", _drift(0.97)), rows=(SetRow(frozenset({"source_drift"}), frozenset(), 1.0),))
+    assert told_by_all((alone,)) == [alone]
 
 
 def test_an_effect_of_a_camera_has_an_entry_for_each_side() -> None:

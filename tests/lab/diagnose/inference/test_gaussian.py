@@ -33,3 +33,15 @@ def test_gaussians_agree_with_their_formulas() -> None:
     assert gaussian.log_likelihood(y) == pytest.approx(-0.5 * r @ solved - 0.5 * np.linalg.slogdet(dense)[1], rel=1e-4)
     more = gaussian.with_discrepancy(0, np.eye(4))
     np.testing.assert_allclose(more.covariance - dense, np.diag([1.0] * 4 + [0.0] * 3), atol=1e-4)
+
+
+def test_a_variance_beyond_rounding_leaves_a_chi2() -> None:
+    """One free quantity with a variance of 1e20 in numbers of unit noise: rounding leaves the dense covariance
+    indefinite. What lies across that quantity keeps a chi2, of at most what unit noise gives."""
+    rng = np.random.default_rng(1)
+    free = rng.standard_normal((30, 1)) * 1e10
+    residual = rng.standard_normal(30)
+    covariance = np.eye(30) + free @ free.T
+    value = chi2(residual, covariance)
+    assert np.isfinite(value)
+    assert 0.0 <= value <= float(residual @ residual)

@@ -10,7 +10,7 @@ from lab.diagnose import diagnose
 from lab.fit import fit_recording_set
 from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.results import Emva1288, NoiseFit
-from lab.report.emva import compared_estimates, table_rows
+from lab.report.emva import compare_estimates, table_rows
 from tests.lab.mono_session import MonoSession
 
 
@@ -98,7 +98,7 @@ def test_two_estimates_of_the_gain_are_compared_and_the_line_knows_its_model_err
     session = MonoSession(shape=(96, 96), bend=bend, levels=16, prnu=0.005, seed=2)
     noise, own = fitted(session)
     assert abs(own.system_gain_dn_per_e - session.gain) < 3.0 * own.system_gain_dn_per_e_std
-    gains = [line for line in compared_estimates(noise) if "system gain" in line]
+    gains = [line for line in compare_estimates(noise) if "system gain" in line]
     assert len(gains) == 1 and "combined standard deviations apart: with nonlinearity or a brighter-fatter" in gains[0]
     assert noise.conversion_gain_dn_per_e is not None
     percent = 100.0 * (own.system_gain_dn_per_e / noise.conversion_gain_dn_per_e - 1.0)
@@ -111,6 +111,6 @@ def test_estimates_of_another_amplification_are_compared_at_the_same() -> None:
     captures = tuple(c.model_copy(update={"gain_db": 20.0}) for c in recordings.manifest.captures)
     noise = fit_noise(recordings.under(recordings.manifest.model_copy(update={"captures": captures})), "left")
     assert noise.gain_db == 20.0 and noise.conversion_gain_dn_per_e == pytest.approx(0.25, rel=0.05)
-    (line,) = (one for one in compared_estimates(noise) if "system gain" in one)
+    (line,) = (one for one in compare_estimates(noise) if "system gain" in one)
     shown = float(line.split(" DN/e, ")[2].split(" %")[0])
     assert abs(shown) < 5.0

@@ -9,8 +9,9 @@ from scipy.special import erf
 
 from lab.errors import InputError, NotDetermined
 from lab.fit.geometry import fit_geometry
+from lab.foreign_recordings import read_foreign
 from lab.formats import recording_set as recording
-from lab.formats.importers import ImportOptions, read_dot_grids, read_foreign
+from lab.formats.importers import ImportOptions, read_dot_grids
 from lab.observables.boards.dots import dot_centres, dot_grid
 
 ROWS, COLS, SPACING_MM, RADIUS_MM = 7, 9, 10.0, 2.5

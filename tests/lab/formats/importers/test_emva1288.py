@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from lab.errors import InputError
 from lab.fit.noise.noise_fit import fit_noise
+from lab.foreign_recordings import read_foreign
 from lab.formats import recording_set as recording
-from lab.formats.importers import read_foreign
 from lab.formats.importers.emva1288 import parse_descriptor, read_emva1288
 
 DATA = Path(__file__).resolve().parents[5] / "shared" / "data" / "emva1288_ccd"

@@ -9,8 +9,9 @@ from astropy.io import fits
 
 from lab.errors import InputError
 from lab.fit.noise.noise_fit import fit_noise
+from lab.foreign_recordings import read_foreign
 from lab.formats import recording_set as recording
-from lab.formats.importers import read_fits_folder, read_foreign, read_raw_folder
+from lab.formats.importers import read_fits_folder, read_raw_folder
 from lab.formats.importers.frame_settings import ALL_FRAMES, KEYWORDS, SETTINGS, SharedBy, is_same, parse_choice
 from lab.formats.importers.single_picture import ImportOptions
 from lab.formats.recording_set import RecordingError

@@ -11,7 +11,8 @@ import tifffile
 
 from lab.errors import InputError
 from lab.fit.noise.noise_fit import fit_noise
-from lab.formats.importers import ImportOptions, read_foreign
+from lab.foreign_recordings import read_foreign
+from lab.formats.importers import ImportOptions
 from lab.formats.importers.own_statements import sensor_facts
 from lab.formats.raw_file import RawMetadata, write_raw
 from sim.camera import CameraModel, Cfa, Lens

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from lab.errors import InputError
 from lab.fit.geometry import fit_geometry
 from lab.fit.stereo import fit_stereo
+from lab.foreign_recordings import read_foreign
 from lab.formats import recording_set as recording
-from lab.formats.importers import ImportOptions, read_foreign
+from lab.formats.importers import ImportOptions
 from lab.formats.importers.raw_folder import capture_of_row, read_checkerboard_pairs, read_index, read_raw_folder
 
 DATA = Path(__file__).resolve().parents[5] / "shared" / "data" / "opencv_stereo"

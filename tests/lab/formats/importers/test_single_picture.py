@@ -10,8 +10,9 @@ from scipy.special import erf
 
 from lab.errors import InputError
 from lab.fit.mtf import fit_mtf
+from lab.foreign_recordings import read_slanted_edge
 from lab.formats import recording_set as recording
-from lab.formats.importers import ImportOptions, read_colour_chart, read_slanted_edge
+from lab.formats.importers import ImportOptions, read_colour_chart
 from lab.formats.importers.single_picture import located_chart
 from lab.formats.recording_set import DataSheet
 from sim.scene.colorchecker import PATCHES, reflectances

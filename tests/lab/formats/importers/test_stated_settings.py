@@ -13,8 +13,9 @@ import tifffile
 from astropy.io import fits
 
 from lab.errors import InputError
+from lab.foreign_recordings import read_foreign
 from lab.formats import recording_set as recording
-from lab.formats.importers import read_foreign, read_raw_folder
+from lab.formats.importers import read_raw_folder
 from lab.formats.importers.frame_settings import parse_choice
 from lab.formats.importers.single_picture import ImportOptions
 from lab.formats.importers.stated_settings import frame_header

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
-from lab.cli.console import EXIT_INPUT
 from lab.errors import DeviceError, InputError
 
 BENCH_START_S, BENCH_END_S = 60.0, 10.0
@@ -26,7 +25,7 @@ def mock_bench(conceal: Sequence[str], options: Sequence[str] = ()) -> Iterator[
     """
     with tempfile.TemporaryDirectory(prefix="calibench-bench-") as folder:
         file = Path(folder) / "station.toml"
-        command = [sys.executable, "-m", "lab.cli", "bench", "--station", str(file), "--with-parent"]
+        command = [sys.executable, "-m", "calibench", "bench", "--station", str(file), "--with-parent"]
         command += [*(f"--conceal={item}" for item in conceal), *options]
         # A session of its own: Ctrl-C ends this process alone, and the bench serves until the shutter is closed.
         bench = subprocess.Popen(
@@ -87,6 +86,6 @@ def _await_ready(bench: subprocess.Popen[str]) -> None:
     code = bench.wait(BENCH_END_S)
     complaining.join(BENCH_END_S)
     why = "\n".join(line.removeprefix("calibench: ") for line in complaints if line)
-    if code == EXIT_INPUT and why:
+    if code == InputError.exit_code and why:
         raise InputError(why)
     raise DeviceError(f"mock bench: it doesn't start ({why or f'exit code {code}'}); see what `calibench bench` prints")
