@@ -84,7 +84,8 @@ def measure_code_density(dataset: Dataset) -> Observable:
         floor = np.concatenate([np.zeros(len(steps)), np.full(len(combs), COMB_FLOOR)])
         light = ExpectedCounts.of(counts[held_out].planes, codes.first, len(codes.count))
         covariances += [
-            _covariance(linear, codes, counts[held_out], light) + np.diag(np.square(floor)),
+            _covariance(linear, codes, counts[held_out], light, _fixed_share(dataset, codes))
+            + np.diag(np.square(floor)),
             np.diag([1.0 + (VARIANCE_FLOOR * p.number / p.chi2_std) ** 2 for p in parts]),
         ]
         members = tuple(counts[held_out].captures)
@@ -233,20 +234,32 @@ def _smoothing(half: int) -> FloatArray:
     return np.asarray(np.linalg.pinv(np.vander(x, DEGREE + 1, increasing=True))[0])
 
 
-def _covariance(linear: FloatArray, codes: CodeHistogram, counts: _Counts, light: ExpectedCounts) -> FloatArray:
+def _covariance(
+    linear: FloatArray, codes: CodeHistogram, counts: _Counts, light: ExpectedCounts, fixed: float
+) -> FloatArray:
     """Return the covariance (m, m) of `linear` (m, codes) @ counts less what is expected.
 
     Each pixel has one code: the counts of a level's pixels are multinomial. What is expected has its local means and
     each plane's mean square from the same pixels: it follows the counts of neighbouring levels along z, and those of a
-    plane along z^2 - 1. Both parts of the counts' noise cancel."""
+    plane along z^2 - 1. Both parts of the counts' noise cancel: of temporal noise. A fixed pattern is the same in all
+    frames, so that its counts scatter more than multinomial ones; its share of the two parts stays, as an upper bound
+    for narrow patterns."""
     covariance = (linear * np.maximum(codes.expected, 1.0)) @ linear.T
     taken = [
         linear[:, first : first + len(direction)] @ direction
         for levels in counts.planes
         for first, direction in (_scatter_of(level, codes) for level in levels)
     ]
-    table = np.concatenate([np.array(taken).T, *(linear @ light.followed(row) for row in (1, 2))], axis=1)
+    temporal = np.sqrt(1.0 - fixed)
+    table = np.concatenate([np.array(taken).T, *(temporal * (linear @ light.followed(row)) for row in (1, 2))], axis=1)
     return covariance - table @ table.T
+
+
+def _fixed_share(dataset: Dataset, codes: CodeHistogram) -> float:
+    """Share of the pixels' variance about their local means that is a fixed pattern, over all counted pixels."""
+    signal = codes.first + np.arange(len(codes.count)) - dataset.noise.black
+    fixed_dn2 = np.square(dataset.noise.prnu * signal)
+    return float(np.average(fixed_dn2 / (fixed_dn2 + np.square(codes.noise)), weights=codes.count))
 
 
 def _scatter_of(level: LevelCounts, codes: CodeHistogram) -> tuple[int, FloatArray]:
