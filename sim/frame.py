@@ -71,8 +71,10 @@ def expected_electrons(
     `margin_px` around the frame, and blurred channel by channel with the channel's transfer function. The light beyond
     the margin is taken as the scene's other end. On random cells of 2 px at f/4 and 3 um pixels, 2, 3, 4, 6 samples a
     pixel leave
-    0.6, 0.2, 0.1, 0.05 % of white rms; a frame of 480 x 640 takes 0.5, 1.1, 2.4 s of one core at 2, 3, 4. `source`:
-    factor on the scene's light, such as `unsteady_source` of the frame that is drawn.
+    0.6, 0.2, 0.1, 0.05 % of white rms; a frame of 480 x 640 takes 0.5, 1.1, 2.4 s of one core at 2, 3, 4. Cells of a
+    whole number of pixels whose borders are the pixels' alias alike all over the frame: at s samples a pixel an
+    amplitude at f cy/px is drawn too high by (pi f / s)^2 / 3 along each axis, 3 % at 0.3 cy/px and 3 samples.
+    `source`: factor on the scene's light, such as `unsteady_source` of the frame that is drawn.
     """
     check_overlap(camera, exposure.scene)
     light = scene_light(

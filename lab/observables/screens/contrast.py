@@ -14,9 +14,11 @@ from sim.effects.base import Effects
 from sim.point import TRANSFER_AT
 
 LARGEST_STD = 0.04  # relative; bands of a larger standard deviation aren't used
-#: Relative standard deviation of a band's contrast beside noise: error of the drawing. Of turned cells it is 1e-4 at
-#: low and 5e-4 at high frequencies, of cells of a whole number of pixels that stand square 1e-4 to 4e-3.
-CONTRAST_FLOOR = 0.0015
+#: Error of the drawing: relative standard deviation of a band's contrast beside noise, over the square of its frequency
+#: in cy/px. Of turned cells it is 2e-5 at 0.1 cy/px, 2e-4 to 5e-4 at 0.3 and 7e-4 to 1e-3 at 0.45 (rms against closed
+#: forms). Of cells of a whole number of pixels that stand square it is the same in green, and twice that in red
+#: and blue.
+DRAWING_ERROR = 0.005
 CONTRAST_SCALE_STD = (
     0.01  # prior standard deviation of the contrast's scale, for each channel of seen and held-out repeats
 )
@@ -43,10 +45,12 @@ def measure_bernoulli(dataset: Dataset) -> Observable:
     if not places:
         raise NotDetermined("bernoulli", "the patterns are too noisy, or too few of their cells are in view")
     reference = np.array([p.bands[b].reference for _, p, b in places])
+    frequency = np.array([label.x for label in labels])
     value = reference * np.array([p.value[b] for _, p, b in places])
     expected = reference * np.array([p.baseline[b] for _, p, b in places])
-    frequency = np.array([label.x for label in labels])
-    covariance = np.outer(reference, reference) * joint_covariance(places) + np.diag((CONTRAST_FLOOR * expected) ** 2)
+    covariance = np.outer(reference, reference) * joint_covariance(places) + np.diag(
+        (DRAWING_ERROR * frequency**2 * expected) ** 2
+    )
     by_place = place_jacobian([(g, r * p.by_place[b]) for (g, p, b), r in zip(places, reference, strict=True)])
     scales = [f"pattern:{number}:{p.channel}:{p.held_out}" for number, p, _ in places]
     changes = dataset.once(pattern_changes)

@@ -22,7 +22,7 @@ from lab.observables.observable import measurements
 from lab.observables.screens.bands import ACROSS, BORDER, GHOST, RADIAL, RADIAL3, SHIFT_X, PlacedPattern
 from lab.observables.screens.canvas import pattern_window
 from lab.observables.screens.cell_borders import BORDER_ERROR
-from lab.observables.screens.contrast import CONTRAST_FLOOR
+from lab.observables.screens.contrast import DRAWING_ERROR
 from lab.observables.screens.ghost import GHOST_ERROR
 from lab.observables.screens.placement import place_pattern
 from sim.camera import Cfa
@@ -66,12 +66,12 @@ def gaussian(fx: NDArray[np.float64], fy: NDArray[np.float64]) -> NDArray[np.flo
 
 @pytest.mark.parametrize("cfa", ORDERS)
 @pytest.mark.parametrize(
-    ("cell_px", "turn_rad", "contrast"),
-    [(4.1, 0.03, 3.0 * CONTRAST_FLOOR), (4.0, 0.001, 0.01)],
+    ("cell_px", "turn_rad", "aliased"),
+    [(4.1, 0.03, 0.0), (4.0, 0.001, 0.01)],
     ids=["turned", "square"],
 )
 def test_what_is_predicted_of_an_image_is_what_the_estimator_finds(
-    cfa: Cfa, cell_px: float, turn_rad: float, contrast: float
+    cfa: Cfa, cell_px: float, turn_rad: float, aliased: float
 ) -> None:
     """Without noise, within three times the errors of the drawing, and of the pattern's place; displacements to 0.003
     px. Of cells of a whole number of pixels that stand square, a band near 1/2 cy/px is told from its aliases by the
@@ -89,7 +89,8 @@ def test_what_is_predicted_of_an_image_is_what_the_estimator_finds(
         away = seen - design.coefficients(design.canvas.image(gaussian)[design.mask])
         of_place = np.sqrt(np.sum(np.square(design.by_place @ place.std.T), axis=1))
         bands = slice(1, design.bands)
-        assert np.all(np.abs(away[bands]) < np.hypot(contrast, 3.0 * of_place[bands]))
+        drawing = DRAWING_ERROR * np.square([band.frequency for band in placed.bands[1:]])
+        assert np.all(np.abs(away[bands]) < np.hypot(np.maximum(3.0 * drawing, aliased), 3.0 * of_place[bands]))
         for at, floor in ((BORDER, BORDER_ERROR), (GHOST, GHOST_ERROR)):
             assert abs(away[design.bands + at]) < 3.0 * np.hypot(floor, of_place[design.bands + at])
         shifts = away[design.shifts] + found.moved
