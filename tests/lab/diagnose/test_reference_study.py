@@ -45,7 +45,7 @@ def drawn(f_number: float, samples: int) -> FloatArray:
 def test_screens_are_drawn_to_the_stated_error_of_the_contrast(f_number: float, error: float) -> None:
     """Against a drawing with `FINE` samples a pixel. There borders lie at the share p = 0.79 of a sample, so that its
     own aliases change the contrast at 0.45 cy/px by 2 (pi 0.45 / 30)^2 (p^2 - p + 1/6) = 1e-5. With 3 samples a pixel
-    and borders at p = 0 it would be off by 3 % at 0.3 cy/px."""
+    and borders at p = 0 it is off by 6 % at 0.3 cy/px and f/4."""
     share = (SCREEN_OFFSET_PX * FINE) % 1.0
     own = abs(2.0 * np.square(np.pi * 0.45 / FINE) * (share**2 - share + 1.0 / 6.0))
     assert own < 2e-5
