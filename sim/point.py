@@ -241,12 +241,14 @@ def mix_channels(
                 moved[i, k] += np.where(source == k, kernel * float(signals[k]), 0.0)
     shape = transfers.shape[1:]
     fx, fy = (np.broadcast_to(f, shape).ravel() for f in (fx_cy_per_px, fy_cy_per_px))
-    along_x, along_y = _turned(right, fx), _turned(down, fy)
+    total = moved.sum(axis=(1, 2, 3))
+    across, along = _turned(down, fy), _turned(right, fx)
+    if len(down) > len(right):  # the longer side by one product: trails are lines
+        across, along, moved = along, across, moved.swapaxes(2, 3)
     out = np.zeros((count, len(fx)), complex)
     for i, k, d in np.argwhere(moved.any(axis=3)):
-        row = (moved[i, k, d] @ along_x.view(float)).view(complex)
-        out[i] += row * along_y[d] * transfers[k].ravel()
-    total = moved.sum(axis=(1, 2, 3))
+        line = (moved[i, k, d] @ along.view(float)).view(complex)
+        out[i] += line * across[d] * transfers[k].ravel()
     lit = total > 0.0
     out[lit] /= total[lit, None]
     out[~lit] = transfers.reshape(count, -1)[~lit]  # no light: as it was

@@ -28,11 +28,11 @@ from lab.cli import (
     simulation,
     standards,
 )
-from lab.cli.console import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, err, out
+from lab.cli.console import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, err, out, warn
 from lab.cli.help import complete_help
 from lab.cli.twin import commands as twin
 from lab.errors import CannotWrite, DeviceError, InputError, Terminated, failure_of_environment
-from sim.extensions import extensions, refuse
+from sim.extensions import extensions, installed, refuse
 
 app = typer.Typer(
     name="calibench",
@@ -75,7 +75,9 @@ def everywhere(
 @cache
 def add_commands() -> None:
     """Add the commands of the entry points `calibench.commands`, once a process: those of `api`, `mocks` and other
-    packages."""
+    packages. Warns where the installation, older than the files, has none."""
+    if not installed("commands"):
+        warn(("the commands of the service and of the mocks aren't installed; install calibench again (`make setup`)",))
     for name, commands in extensions("commands"):
         if not isinstance(commands, typer.Typer):
             refuse("commands", name, f"{commands!r} is no typer.Typer")

@@ -31,6 +31,8 @@ STRONG = 6.0
 _WEAK = 3.0
 #: Points of a table of one amplitude's log odds over z, and of its size.
 _TABLE, _SIZES = 17, 48
+#: Most steps towards the mode of amplitudes with heavy-tailed priors.
+_MODE_STEPS = 40
 _HERMITE = np.polynomial.hermite_e.hermegauss(9)
 _HERMITE = (_HERMITE[0], _HERMITE[1] / _HERMITE[1].sum())
 #: Distance from the mode beyond which an amplitude is integrated along with those near 0: that of the last point.
@@ -125,7 +127,7 @@ def integrate_set(z: FloatArray, gram: FloatArray, members: Sequence[Signature])
     whole = np.array([s.is_whole for s in members for _ in s.columns], bool)
     c = whole.astype(float)
     free = np.flatnonzero(~whole)
-    for _ in range(40):
+    for _ in range(_MODE_STEPS):
         before = c.copy()
         for k in free:
             weight = (DEGREES + 1.0) / (DEGREES + (c[k] / scale[k]) ** 2) / scale[k] ** 2
@@ -135,6 +137,29 @@ def integrate_set(z: FloatArray, gram: FloatArray, members: Sequence[Signature])
     slope = b - a @ c
     found = integrate(a[np.ix_(free, free)], slope[free], [coords[int(k)] for k in free], c[free])
     return float(b @ c - 0.5 * c @ a @ c) + found.log_integral, c
+
+
+def integrate_each(z: FloatArray, gram: FloatArray, signatures: Sequence[Signature]) -> list[tuple[float, FloatArray]]:
+    """Return `integrate_set` of each signature by itself; those of one amplitude together, by quadrature."""
+    found: list[tuple[float, FloatArray]] = [(0.0, np.zeros(0))] * len(signatures)
+    ones = [i for i, s in enumerate(signatures) if len(s.columns) == 1 and not s.is_whole]
+    if ones:
+        own = np.array([signatures[i].columns[0] for i in ones])
+        coords = [signatures[i].coordinates[0] for i in ones]
+        b, a = z[own], np.maximum(gram[own, own], 1e-300)
+        low, scale = np.array([c.lower for c in coords]), np.array([c.scale for c in coords])
+        odds = amplitude_log_odds(b, a, scale, np.isfinite(low))
+        mode = np.zeros(len(ones))
+        for _ in range(_MODE_STEPS):
+            weight = (DEGREES + 1.0) / (DEGREES + np.square(mode / scale)) / np.square(scale)
+            before, mode = mode, np.maximum(b / (a + weight), low)
+            if np.all(np.abs(mode - before) < 1e-4 * scale):
+                break
+        for i, value, c in zip(ones, odds.tolist(), mode, strict=True):
+            found[i] = value, np.array([c])
+    for i in set(range(len(signatures))) - set(ones):
+        found[i] = integrate_set(z, gram, [signatures[i]])
+    return found
 
 
 def amplitude_log_odds(z: FloatArray, square: FloatArray, scale: FloatArray, positive: np.ndarray) -> FloatArray:
@@ -265,21 +290,26 @@ class HealthyDraws:
     ) -> FloatArray:  # fmt: skip
         """Return p(no effect, nothing unlisted) of all draws, (D,), roughly and mostly too low: the scales of all other
         groups are at their medians, so that effects and flips also take what a group with a larger scale left."""
-        groups, draws, at = self.scales.groups, self.projected.shape[1], len(self.scales.gram)
+        groups, draws = self.scales.groups, self.projected.shape[1]
         middle = np.array([float(g.everyday_quantile(np.array(0.5))) for g in groups])
         flips = [np.zeros(draws)]
         more_prior = self.scales.prior_log[1] - self.scales.prior_log[0]
-        for g, values in self.scales.profiles_of_processes(middle, self.projected[:at]):
-            flips.append(logsumexp(values + np.log(groups[g].shares(True))[:, None], axis=0) + more_prior[g])
+        by_state: dict[str, FloatArray] = {}  # log evidence of the everyday scales of a state over that of their median
         for g, group in enumerate(groups):
-            if not group.may_be_unlisted or not group.varies(False):
+            if not group.varies(False):
                 continue
-            points = [group.scales(u) for u in (False, True)]
-            values = self.scales.profiles(g, middle, np.concatenate(points), self.projected[:at])
-            values += np.log(np.concatenate([group.shares(u) for u in (False, True)]))[:, None]
-            usual, other = np.split(values, [len(points[0])])
-            more = logsumexp(other, axis=0) - logsumexp(usual, axis=0)
-            flips.append(more + more_prior[g])
+            points, other = group.scales(False), group.scales(True) if group.may_be_unlisted else np.zeros(0)
+            at = np.concatenate([points, other, middle[g : g + 1]])
+            values = self.scales.profiles(g, middle, at, self.projected[: len(self.scales.gram)])
+            usual = logsumexp(values[: len(points)] + np.log(group.shares(False))[:, None], axis=0)
+            by_state[group.name] = usual - values[-1]
+            if group.may_be_unlisted:
+                beyond = values[len(points) : -1] + np.log(group.shares(True))[:, None]
+                flips.append(logsumexp(beyond, axis=0) - usual + more_prior[g])
+        for g, values in self.scales.profiles_of_processes(middle, self.projected[: len(self.scales.gram)]):
+            group = groups[g]
+            more = logsumexp(values + np.log(group.shares(True))[:, None], axis=0)
+            flips.append(more - by_state.get(group.name, np.zeros(draws)) + more_prior[g])
         gains = gains_of(self._odds(middle, signatures), hypotheses, signatures)
         return 1.0 / (np.exp(logsumexp(flips, axis=0)) + others_over_empty(gains, prior))
 

@@ -24,7 +24,7 @@ from lab.inference.hypotheses import EffectParameter, Hypothesis, SetPrior, effe
 from lab.inference.model import Group, State
 from lab.inference.search import Search, Table
 from lab.inference.statements.statement import (
-    Change,
+    AffineChange,
     Changes,
     Numbers,
     Restatement,
@@ -74,7 +74,7 @@ class SideModel:
             found.append(effect_at(point, self.parameters[name]))
         return tuple(found)
 
-    def changes(self, state: State) -> tuple[Change, ...]:
+    def changes(self, state: State) -> tuple[AffineChange, ...]:
         """Return the changes of the prediction by the wrong statements of a state."""
         found = []
         for name in sorted(state):
@@ -263,12 +263,10 @@ def hypotheses_of(measured: MeasurementModel) -> dict[str, Hypothesis]:
         if not measured.affected(kind).any():
             continue
         one = hypothesis_of(kind, measured.camera)
-        shown = [
-            float(np.linalg.norm(gaussian.whiten(measured.mean((point.template,)) - base))) * scale
-            for alternative in one.alternatives
-            for point, scale in zip(alternative.points, alternative.scales, strict=True)
-        ]
-        if max(shown) > LEAST_SHOWN:
+        changes = [measured.mean((p.template,)) - base for alternative in one.alternatives for p in alternative.points]
+        scales = [scale for alternative in one.alternatives for scale in alternative.scales]
+        shown = np.linalg.norm(gaussian.whiten(np.column_stack(changes)), axis=0) * scales
+        if shown.max() > LEAST_SHOWN:
             found[kind.name] = one
     return found
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg.blas import dsyrk
 from scipy.optimize import least_squares
 
 from lab.inference.closed_form import (
@@ -20,6 +21,7 @@ from lab.inference.closed_form import (
     HealthyDraws,
     Signature,
     gains_of,
+    integrate_each,
     integrate_set,
     log_mean_exp,
     others_over_empty,
@@ -588,7 +590,8 @@ class Search:
             gaussian = with_columns(gaussian, origin.jacobian / np.sqrt(origin.precision))
             residual = residual - origin.jacobian @ (origin.pull / origin.precision)
         white = gaussian.whiten(np.column_stack([*(g.columns for g in self.model.groups), self._stack, residual]))
-        return np.asarray(white.T @ white)
+        upper = dsyrk(1.0, white.T)
+        return np.asarray(upper + np.triu(upper, 1).T)
 
     def _linear(self, gram: FloatArray, tau: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return z and R of the signatures with the groups at these scales (G,) marginalised, given `_gram`."""
@@ -651,12 +654,12 @@ class Search:
     def _linearise_with(self, origin: FittedSet, unlisted: frozenset[int], whole: FloatArray) -> None:
         z, gram = self._linear(whole, origin.likeliest.scales.mode(unlisted))
         signatures = self._signatures
-        single: dict[int, tuple[float, FloatArray]] = {}
         owners: dict[str, list[int]] = {}
         for i, s in enumerate(signatures):
             if s.owner not in origin.state:
-                single[i] = integrate_set(z, gram, [s])
                 owners.setdefault(s.owner, []).append(i)
+        outside = [i for own in owners.values() for i in own]
+        single = dict(zip(outside, integrate_each(z, gram, [signatures[i] for i in outside]), strict=True))
         ratio = self._averaged_over_scales(origin.likeliest.scales, unlisted, whole, single)
         gains = {
             o: log_sum_exp([ratio[i] + signatures[i].log_share for i in own]) - float(np.log(len(own)))

@@ -11,10 +11,6 @@ from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import Uniform
 
 REFERENCE_NM = 550.0  # light in which effects displace corners: green
-#: Standard deviation beside noise. Of healthy cameras before a turned pattern noise alone is right (chi2 a number of
-#: 1.2 without it): it stands for the displacement that a strong blur makes of cells of a whole number of pixels that
-#: stand square, 0.018 px, which no prediction has.
-COLOUR_FLOOR_PX = 0.012
 
 
 def colour_shift_px(

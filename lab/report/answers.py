@@ -168,7 +168,7 @@ def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
             nothing = sum(item.probability for item in one.sets if not item.effects and not item.unlisted)
             yield f"No effect and nothing unlisted in the {one.side} camera: probability {nothing:.3f}."
     held = diagnosis.held_out
-    if held is not None and held.n and (diagnosis.effects or held.chi2_discovered is not None):
+    if held is not None and held.n and (diagnosis.effects or diagnosis.discovered):
         laws = held.chi2_discovered
         beside = "" if laws is None else f", and with the laws without a name to {_short(laws / held.n)}"
         yield (

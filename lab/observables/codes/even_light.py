@@ -250,8 +250,8 @@ def even_light(plane: Any, dataset: Dataset, fine: FloatArray | float) -> tuple[
     lowest = float(surface.min())
     above = surface.ravel().astype(float) - lowest
     group = (above / step).astype(int)
-    number = np.bincount(group)
-    share = np.maximum(number, 1)
+    number = np.bincount(group).astype(float)
+    share = np.maximum(number, 1.0)
     mean = np.bincount(group, above) / share
     within = np.maximum(np.bincount(group, np.square(above)) / share - np.square(mean), 0.0)
     of = number > 0

@@ -11,6 +11,7 @@ from lab.errors import NotDetermined
 from lab.observables.darks.defective_pixels import COUNT_STD, rooted_counts
 from lab.observables.darks.frames import DarkStatistics, captures_of, dark_frames
 from lab.observables.dataset import Dataset
+from lab.observables.noise.robust import lower_median, sampled
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray
@@ -54,17 +55,20 @@ def count_events(dataset: Dataset) -> list[_Events]:
         if len(captures) < LEAST_FRAMES or moving is None:
             continue
         frames = np.array([dataset.recordings.frame(c) for c in captures], np.float32)
-        frames -= np.median(frames, axis=(1, 2), keepdims=True)
-        top = np.sort(frames, axis=0)[-2:]
-        usual = np.median(frames, axis=0)
+        frames -= np.array([np.median(sampled(frame)) for frame in frames], np.float32)[:, None, None]
+        highest, second = np.maximum(frames[0], frames[1]), np.minimum(frames[0], frames[1])
+        for frame in frames[2:]:
+            second = np.maximum(second, np.minimum(highest, frame))
+            highest = np.maximum(highest, frame)
+        usual = lower_median(frames) if len(frames) in {3, 5} else np.median(frames, axis=0)
         std = np.sqrt(moving + dataset.noise.gain * np.maximum(usual, 0.0))
         least = np.maximum(BRIGHT * std, LEAST_STEPS * dataset.step_dn)
-        hit = top[1] - top[0] > least
+        hit = highest - second > least
         edges = float(np.median(least)) * np.array(EVENT_EDGES)
         counts = {True: np.zeros(len(edges)), False: np.zeros(len(edges))}
         seen = len(dark.condition.seen)
         for k, frame in enumerate(frames):
-            own = hit & (frame == top[1])
+            own = hit & (frame == highest)
             label, number = ndimage.label(own, TOUCHING)
             if number:
                 bright = ndimage.maximum(frame - usual, label, np.arange(1, number + 1))

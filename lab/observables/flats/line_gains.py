@@ -182,12 +182,13 @@ def _share_and_modes(lines: Lines, count: int) -> tuple[FloatArray, FloatArray]:
     The amplitudes of a band are normal with the covariance G = V*V, V the waves in the window after the projection. The
     mean of their powers has the relative variance sum |G|^2 / (tr G)^2, that of n independent ones 1 / n."""
     left, modes = [], []
-    line, window = np.arange(count)[:, None], _window(count)[:, None]
+    window = _window(count)
     base = _repeats(count) if lines == "rows" else np.zeros((count, 0))
+    of_window, of_base = np.fft.fft(np.square(window)), np.fft.fft(base * window[:, None], axis=0)
     for band in _bands(count):
-        waves = window * np.exp(-2j * np.pi * line * np.arange(band.start, band.stop) / count)
-        waves = waves - base @ (base.T @ waves)
-        common = waves.conj().T @ waves
+        wave = np.arange(band.start, band.stop)
+        # of waves in the window, by their distance, less what the projection takes of them
+        common = of_window[wave[None, :] - wave[:, None]] - of_base[band].conj() @ of_base[band].T
         whole = float(np.real(np.trace(common)))
         left.append(whole / count / (band.stop - band.start))
         modes.append(whole**2 / float(np.sum(np.square(np.abs(common)))))

@@ -175,20 +175,20 @@ def _read(dataset: Dataset, captures: Sequence[Any], lit: bool, held_out: bool) 
     if lit and clipped > 0.1 * CLIPPED_SHARE:
         return None
     bright = level > 20.0 * max(abs(dataset.noise.dark_dn_per_s) * captures[0].exposure_s, 1.0)
-    level_out(frames, cfa, dataset.noise.black if lit and bright else None)
     freedom = len(frames) - 1
-    pixel_dn2 = sum(float(np.mean(np.square(f), dtype=float)) for f in frames) / freedom
+    frames, alike = level_out(frames, cfa, dataset.noise.black if lit and bright else None)
+    pixel_dn2 = alike * sum(float(np.mean(np.square(f), dtype=float)) for f in frames) / freedom
     if pixel_dn2 < (LEAST_DN * dataset.step_dn) ** 2:
         return None
     for name in mosaic.planes(frames[0], cfa):
         planes = [mosaic.planes(f, cfa)[name] for f in frames]
-        std = np.sqrt(sum(float(np.mean(np.square(p), dtype=float)) for p in planes) / freedom)
+        std = np.sqrt(alike * sum(float(np.mean(np.square(p), dtype=float)) for p in planes) / freedom)
         for plane in planes:
             np.divide(plane, np.float32(max(std, 1e-6)), out=plane)
             plane[np.abs(plane) > OUTLIER] = 0.0
     sums, parts = [], []
     for one in RELATIONS.values():
-        by_row = sum(np.einsum("ij,ij->i", *one(frame), dtype=float) for frame in frames)
+        by_row = alike * sum(np.einsum("ij,ij->i", *one(frame), dtype=float) for frame in frames)
         size = one(frames[0])[0].size
         sums.append(by_row.sum() / freedom / size)
         split = [np.sum(rows) for rows in np.array_split(by_row, PARTS)]

@@ -75,7 +75,7 @@ def _of_repeats(dataset: Dataset, captures: Sequence[FlatCapture], held_out: boo
         if shot < 0.2 * variance or variance < LEAST_DN2 * dataset.step_dn**2:
             continue
         factor = n / ((n - 1.0) * (n - 2.0))
-        third = factor * float(np.sum(away[:, kept] ** 3)) / pixels
+        third = factor * float(np.sum(np.einsum("k...,k...,k...->...", away, away, away)[kept])) / pixels
         std = np.sqrt(6.0 * factor / pixels) * variance**1.5 * signal / shot**2
         if std < MOST_STD:
             found.append(

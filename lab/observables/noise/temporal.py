@@ -100,19 +100,20 @@ def repeats_of(dataset: Dataset, captures: Sequence[Any], held_out: bool) -> Rep
         signal[name] = float(np.mean([p.mean(dtype=float) for p in planes])) - dataset.noise.black
     level = float(np.mean(list(signal.values())))
     dark_dn = abs(dataset.noise.dark_dn_per_s) * captures[0].exposure_s
-    level_out(frames, cfa, dataset.noise.black if lit and level > 20.0 * max(dark_dn, 1.0) else None)
     freedom = len(frames) - 1
+    bright = lit and level > 20.0 * max(dark_dn, 1.0)
+    frames, alike = level_out(frames, cfa, dataset.noise.black if bright else None)
     sizes = {name: plane.shape for name, plane in mosaic.planes(first, cfa).items()}
     variance = {}
     for name, (rows, cols) in sizes.items():
         planes = [mosaic.planes(f, cfa)[name] for f in frames]
         taken = (1.0 - 1.0 / rows) * (1.0 - 1.0 / cols)
-        variance[name] = sum(float(np.mean(np.square(p), dtype=float)) for p in planes) / freedom / taken
+        variance[name] = alike * sum(float(np.mean(np.square(p), dtype=float)) for p in planes) / freedom / taken
         for plane in planes:
             np.divide(plane, np.float32(np.sqrt(max(variance[name], 1e-12))), out=plane)
             plane[np.abs(plane) > OUTLIER] = 0.0
     tones = [_take_out_tones(frame) for frame in frames]
-    correlation = _correlations(frames, freedom, cfa)
+    correlation = _correlations(frames, alike, freedom, cfa)
     covariance = independent_correlations(first.shape, freedom, cfa)[1]
     clean = {name: share < 0.1 * CLIPPED_SHARE for name, share in clipped.items()}
     moving = min(variance.values()) > LEAST_DN2 * dataset.step_dn**2
@@ -138,9 +139,12 @@ def repeats_of(dataset: Dataset, captures: Sequence[Any], held_out: bool) -> Rep
     )
 
 
-def level_out(frames: Sequence[Any], cfa: Cfa, black_dn: float | None) -> None:
+def level_out(frames: list[Any], cfa: Cfa, black_dn: float | None) -> tuple[list[Any], int]:
     """Reduce frames, in place, to departures from their mean frame without row and column means. Levels are matched by
-    factors above `black_dn`, or by subtraction where that is None."""
+    factors above `black_dn`, or by subtraction where that is None.
+
+    Returns the departures, and how many frames each stands for: of two frames, those of the second are those of the
+    first with the opposite sign, and are left out."""
     for name in mosaic.planes(frames[0], cfa):
         planes = [mosaic.planes(f, cfa)[name] for f in frames]
         means = [float(p.mean(dtype=float)) for p in planes]
@@ -150,11 +154,17 @@ def level_out(frames: Sequence[Any], cfa: Cfa, black_dn: float | None) -> None:
             else:
                 np.subtract(plane, np.float32(black_dn), out=plane)
                 np.multiply(plane, np.float32((np.mean(means) - black_dn) / (mean - black_dn)), out=plane)
-        average = np.mean(planes, axis=0, dtype=np.float32)
+        if len(planes) == 2:
+            planes, other = planes[:1], planes[1]
+            np.multiply(np.subtract(planes[0], other), np.float32(0.5), out=planes[0])
+        else:
+            average = np.mean(planes, axis=0, dtype=np.float32)
+            for plane in planes:
+                np.subtract(plane, average, out=plane)
         for plane in planes:
-            np.subtract(plane, average, out=plane)
             np.subtract(plane, plane.mean(axis=1, keepdims=True), out=plane)
             np.subtract(plane, plane.mean(axis=0, keepdims=True), out=plane)
+    return (frames[:1], 2) if len(frames) == 2 else (frames, 1)
 
 
 def _take_out_tones(frame: Any) -> float:
@@ -174,15 +184,16 @@ def _take_out_tones(frame: Any) -> float:
 _NUMBER = np.array([2.0 * len(lags) for lags in PAIRS.values()])
 
 
-def _correlations(frames: Sequence[Any], freedom: int, cfa: Cfa) -> FloatArray:
-    """Correlations (6,) of standardised departures by `PAIRS`, less their expectation for independent pixels."""
+def _correlations(frames: Sequence[Any], alike: int, freedom: int, cfa: Cfa) -> FloatArray:
+    """Correlations (6,) of standardised departures by `PAIRS`, less their expectation for independent pixels. `alike`:
+    number of frames that each stands for."""
     found = []
     for lags in PAIRS.values():
         total = 0.0
         for down, right in lags:
             here, there = _moved(frames[0].shape, down, right)
             total += sum(float(np.einsum("ij,ij->", f[here], f[there], dtype=np.float64)) for f in frames)
-        found.append(total / (freedom * _count(frames[0].shape, lags)))
+        found.append(alike * total / (freedom * _count(frames[0].shape, lags)))
     return np.array(found) - independent_correlations(frames[0].shape, freedom, cfa)[0]
 
 

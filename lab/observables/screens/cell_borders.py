@@ -8,11 +8,13 @@ from lab.observables.dataset import Dataset
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import SHOWN
 from lab.observables.screens.bands import BORDER
-from lab.observables.screens.patterns import joint_covariance, patterns, place_jacobian
+from lab.observables.screens.patterns import drawing_covariance, joint_covariance, patterns, place_jacobian
 from sim.effects.base import Effects
 from sim.uniform import Uniform
 
-BORDER_FLOOR = 2e-4  # standard deviation of the light at borders beside noise: error of the drawing
+#: Standard deviation by the error of the drawing, which all numbers of a pattern have in common: 1 to 2e-4 against sums
+#: of exact transforms of square cells of 4 px, at f/2.8 and f/5.6.
+BORDER_ERROR = 2e-4
 
 
 def measure_cell_borders(dataset: Dataset) -> Observable:
@@ -41,7 +43,7 @@ def measure_cell_borders(dataset: Dataset) -> Observable:
 
     return Observable(
         measurement=CELL_BORDERS, reach=1e9, value=value,
-        covariance=joint_covariance(points) + np.diag(np.full(len(value), BORDER_FLOOR**2)),
+        covariance=joint_covariance(points) + drawing_covariance(points, BORDER_ERROR),
         labels=tuple(Label(float(i), p.channel, "borders of cells", p.captures, p.held_out) for i, (_, p,
         _) in enumerate(points)),
         reads=SHOWN | {"signal.response"}, predict=predict, scale=np.ones(len(value)),

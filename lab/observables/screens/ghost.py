@@ -8,10 +8,12 @@ from lab.observables.dataset import Dataset
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import REFLECTIONS, acting
 from lab.observables.screens.bands import GHOST
-from lab.observables.screens.patterns import joint_covariance, patterns, place_jacobian
+from lab.observables.screens.patterns import drawing_covariance, joint_covariance, patterns, place_jacobian
 from sim.effects.base import Effects
 
-GHOST_FLOOR = 1.5e-4  # standard deviation of a ghost's share beside noise
+#: Standard deviation by the error of the drawing, which all numbers of a pattern have in common: 5e-5 to 7e-5 against
+#: sums of exact transforms of square cells of 4 px, at f/2.8 and f/5.6.
+GHOST_ERROR = 7e-5
 
 
 def measure_ghost(dataset: Dataset) -> Observable:
@@ -29,7 +31,7 @@ def measure_ghost(dataset: Dataset) -> Observable:
 
     return Observable(
         measurement=PATTERN_GHOST, reach=1e9, value=value,
-        covariance=joint_covariance(points) + np.diag(np.full(len(value), GHOST_FLOOR**2)),
+        covariance=joint_covariance(points) + drawing_covariance(points, GHOST_ERROR),
         labels=tuple(Label(float(i), p.channel, "ghost", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
         reads=REFLECTIONS, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip

@@ -19,7 +19,7 @@ from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.errors import NotDetermined
 from lab.observables.dataset import Dataset, held_out_of
 from lab.observables.reads import SHOWN, acting
-from lab.observables.screens.bands import GHOST, RINGS_CY_PER_PX, Band, ColourRegression, PlacedPattern
+from lab.observables.screens.bands import ACROSS, GHOST, RINGS_CY_PER_PX, Band, ColourRegression, PlacedPattern
 from lab.observables.screens.canvas import pattern_window
 from lab.observables.screens.placement import PatternPlace, even_powers, pattern_place
 from lab.observables.screens.poses import ScreenPictures, ScreenPose, refuse_saturated, screen_poses
@@ -54,7 +54,7 @@ class Pattern:
     shown: FloatArray  # (k, k): covariance by temporal noise of the repeats
     common: FloatArray  # (k, k): covariance by what seen and held-out repeats share: white and black
     by_place: FloatArray  # (k, directions): change by the independent errors of the pattern's place
-    #: (bands, EVEN_TERMS + 4 bands + parts): change of the bands' coefficients by a unit of even powers of the
+    #: (bands + ACROSS + 1, EVEN_TERMS + 4 bands + parts): change of these coefficients by a unit of even powers of the
     #: frequency times the baseline's P, of the halves of the bands, of these with a phase of 90 degrees, and of changes
     #: of the OTF by `beyond_reference` at the nodes beyond the bands.
     mix: FloatArray
@@ -235,7 +235,7 @@ class _Baseline:
 
         return _Baseline(
             coefficients=design.coefficients(image),
-            mix=np.column_stack([design.weights[: design.bands] @ piece for piece in pieces]),
+            mix=np.column_stack([design.weights[: design.bands + ACROSS + 1] @ piece for piece in pieces]),
             beyond=np.array([part.fx + part.fy for part in at]).reshape(len(at), 2, 2),
             shown_by=shown_by,
         )
@@ -285,6 +285,12 @@ def joint_covariance(places: Sequence[tuple[int, Pattern, int]]) -> FloatArray:
             both = p.common[b, c] if p is q else 0.5 * (p.common[b, c] + q.common[b, c])
             table[i, j] = table[j, i] = both + (p.shown[b, c] if p is q else 0.0)
     return table
+
+
+def drawing_covariance(places: Sequence[tuple[int, Pattern, int]], std: float) -> FloatArray:
+    """Covariance (n, n) of n coefficients by the error of the drawing, which all of a pattern have in common."""
+    group = np.array([number for number, *_ in places])
+    return np.asarray(std**2 * (group[:, None] == group))
 
 
 def place_jacobian(places: Sequence[tuple[int, FloatArray]]) -> dict[str, FloatArray]:

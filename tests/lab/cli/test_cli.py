@@ -544,6 +544,16 @@ def test_import_writes_a_set_or_nothing(tmp_path: Path, flats: Path, capsys: pyt
     assert sorted(path.name for path in tmp_path.iterdir()) == ["flats", "out", "raws"]
 
 
+def test_an_installation_without_the_services_commands_is_a_warning(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Files that are newer than the installation would lose these commands silently."""
+    monkeypatch.setattr(entry, "installed", lambda group: ())
+    monkeypatch.setattr(entry, "extensions", lambda group: iter(()))
+    entry.add_commands.__wrapped__()
+    assert "install calibench again" in " ".join(capsys.readouterr().err.split())
+
+
 def test_the_command_itself(tmp_path: Path) -> None:
     """The real process: its exit code, its one line, and no traceback."""
     done = subprocess.run(

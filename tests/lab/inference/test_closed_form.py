@@ -13,7 +13,7 @@ from scipy.integrate import quad
 from scipy.special import logsumexp
 from scipy.stats import t as student_t
 
-from lab.inference.closed_form import Signature, amplitude_log_odds, signature_log_odds
+from lab.inference.closed_form import Signature, amplitude_log_odds, integrate_each, integrate_set, signature_log_odds
 from lab.inference.hypotheses import Coordinate, SetPrior
 from lab.inference.model import Group, Point, State
 from lab.inference.posterior import read_table
@@ -47,6 +47,23 @@ def test_an_amplitude_is_integrated_as_by_quadrature(signal: float, width: float
     exact = np.log((2.0 if positive else 1.0) * sum(parts)) + 0.5 * top**2
     found = amplitude_log_odds(np.array([signal]), np.ones(1), np.array([width]), np.array([positive]))[0]
     assert found == pytest.approx(exact, abs=0.01)
+
+
+def test_each_signature_is_integrated_as_a_set_of_its_own() -> None:
+    """Of one column by quadrature, where a set has Laplace's integral with the prior's tails (0.02 nats), and with the
+    same mode; of two as the set."""
+    scale = (0.5, 1.0, 30.0, 1.0, 2.0)
+    lower = (0.0, -np.inf, 0.0, 0.0, 0.0)
+    coordinates = [Coordinate("a", w, lower=lo) for w, lo in zip(scale, lower, strict=True)]
+    raw = np.zeros((1, 1))
+    signatures = [Signature(f"s{k}", 0, raw, (coordinates[k],), (k,), ()) for k in range(3)]
+    signatures.append(Signature("pair", 0, raw, tuple(coordinates[3:]), (3, 4), ()))
+    gram = np.diag([4.0, 9.0, 1.0, 2.0, 3.0]) + 0.3
+    z = np.array([1.5, -20.0, -0.7, 2.0, 4.0])
+    for one, (value, mode) in zip(signatures, integrate_each(z, gram, signatures), strict=True):
+        wanted, at = integrate_set(z, gram, [one])
+        assert value == pytest.approx(wanted, abs=0.02)
+        np.testing.assert_allclose(mode, at, atol=1e-3)
 
 
 def test_two_weak_columns_are_integrated_as_by_quadrature() -> None:

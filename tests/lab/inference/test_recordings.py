@@ -10,10 +10,11 @@ import pytest
 from evaluation.draw import recordings_of
 from evaluation.independent_simulator import LISTED, WHOLE_SESSION, ConcealedCamera, Law
 from lab.inference.check import check_held_out, held_out_ids, passes
-from lab.inference.hypotheses import hypothesis_of
+from lab.inference.hypotheses import effect_at, hypothesis_of, parameters_of
 from lab.inference.posterior import read_table
 from lab.inference.recordings import SideModel, SideProblem, measure_side, search_side
-from sim.effects.library import effect
+from sim.effects.empirical_law import EmpiricalLaw
+from sim.effects.library import candidates, effect
 
 PLAN = replace(WHOLE_SESSION, kinds=("dark", "flat"))
 
@@ -58,6 +59,26 @@ def test_without_form_errors_the_gaussian_is_the_measurement_models(healthy: Sid
     np.testing.assert_allclose(plain.covariance, expected.covariance)
     assert np.all(np.diag(wide.covariance) >= np.diag(plain.covariance))
     assert np.any(np.diag(wide.covariance) > np.diag(plain.covariance))
+
+
+def test_an_effect_is_itself_at_its_own_parameters(healthy: SideProblem) -> None:
+    """What was predicted of a prototype isn't predicted once more of the same values to rounding."""
+    camera = healthy.measured.camera
+    for kind in candidates():
+        for alternative in hypothesis_of(kind, camera).alternatives:
+            for point in alternative.points:
+                assert effect_at(point, parameters_of(kind, camera)) is point.template, kind.name
+
+
+def test_an_effect_acts_on_the_blocks_that_it_changes_as_it_stands(healthy: SideProblem) -> None:
+    """A law of any stage, here of the response, leaves blocks alone that others of its kind change; its prediction is
+    that of each block."""
+    law = EmpiricalLaw(stage="signal", along="level", of="mean", at=(100.0, 5000.0), table=(1.0, 1.01), strength=1.0)
+    model = healthy.measured
+    (numbered,) = model._numbered((law,))
+    assert 0 < sum(numbered.acts) < sum(model.acts(EmpiricalLaw))
+    np.testing.assert_array_equal(model.mean((law,)), np.concatenate([b.predict((law,)).mean for b in model.blocks]))
+    assert np.any(model.mean((law,)) != model.mean())
 
 
 def test_groups_move_held_out_numbers_by_the_same_disturbance(healthy: SideProblem) -> None:

@@ -151,7 +151,7 @@ def test_a_name_on_one_side_leaves_the_other_without_it() -> None:
 
 def test_inclusion_priors_sum_to_the_expected_number() -> None:
     """Sum over hypotheses of p(member) = sum over k of k p_k, where each number has sets."""
-    prior = SetPrior({name: name[0] for name in ("a1", "a2", "a3", "b1", "b2", "c1", "d1")})
+    prior = SetPrior({name: name[0] for name in ("a1", "a2", "a3", "b1", "b2", "c1", "d1", "e1", "f1")})
     reading = SideTable.__new__(SideTable)
     object.__setattr__(reading, "search", type("_Search", (), {"prior": prior})())
     total = sum(reading.inclusion_prior.values())

@@ -95,6 +95,25 @@ def test_a_fixed_pattern_is_no_step_of_the_converter() -> None:
         assert np.all(np.abs(rest[middle]) < 3.5 * np.sqrt(np.diag(block.covariance)[middle]))
 
 
+@pytest.mark.parametrize("step_dn", [0.0, 3.0])
+def test_steps_scatter_about_the_true_law_as_their_covariance_says(step_dn: float) -> None:
+    """Three cameras of 192 x 256 px without and with a step of 3 DN, some 420 places: chi2 is their number within
+    3 sqrt(2 n), the law's second order included."""
+    total, number = 0.0, 0
+    for seed in (21, 22, 23):
+        law = AdcNonlinearityLaw(step_dn, 4, 2)
+        acting = effect("adc_step")(step_dn=law.signed_strength, code_dn=4096.0 * (0.15 + 0.6 * law.uniform[1]))
+        former = ConcealedCamera(seed, (law,) if step_dn else (), rows=192, cols=256, bit_depth=12)
+        recordings = recordings_of(former, Plan(("dark", "flat", "narrowband")))
+        at = Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+        block = measure_code_density(at)
+        steps = [k for k, label in enumerate(block.labels) if label.channel == "step"]
+        away = (block.value - block.predict((acting,) if step_dn else ()).mean)[steps]
+        total += float(away @ np.linalg.solve(block.covariance[np.ix_(steps, steps)], away))
+        number += len(steps)
+    assert abs(total - number) < 3.0 * np.sqrt(2.0 * number)
+
+
 def test_steps_are_measured_where_they_stand() -> None:
     """A highest bit that is 3 DN too heavy leaves 3 codes out at half scale: within 3.5 of the standard uncertainties
     and its law's tolerance, seen and held out. Places at 8 DN of 4096 and more beyond it see none of it."""
