@@ -102,7 +102,9 @@ def _stale_frame(manifest: dict[str, Any], frames: dict[str, Any], _spectra: Any
 
 
 FAULTS: tuple[CaseFault, ...] = (
-    CaseFault("f_number_misstated", _misstated("f_number", lambda rng: float(rng.choice([0.7, 1.4])))),
+    CaseFault(
+        "f_number_misstated", _misstated("f_number", lambda rng: float(rng.choice([0.7, 1.4]))), ("other_f_number",)
+    ),
     CaseFault("exposure_unit", _exposure_unit),
     CaseFault("black_level_misstated", _misstated("black_level_dn", lambda rng: 1.25)),
     CaseFault("pitch_misstated", _misstated("pixel_pitch_um", lambda rng: float(rng.choice([0.8, 1.25])))),

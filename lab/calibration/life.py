@@ -34,7 +34,7 @@ from lab.capture.station import Station
 from lab.capture.store import Store
 from lab.capture.tables import CalibrationRow, FigureRow, ResultRow, SessionRow
 from lab.errors import InputError
-from lab.fit.compare import FALSE_ALARM_RATE, MATRIX_PLACES, Numbers, sidak_part, sigma_of_probability
+from lab.fit.compare import FALSE_ALARM_RATE, MATRIX_PLACES, ComparedNumbers, sidak_part, sigma_of_probability
 from lab.fit.noise.dark_current import SensorTemperature
 from lab.formats.recording_set import InstrumentSnapshot, Snapshots, differences
 from lab.formats.results import FitResult
@@ -571,7 +571,7 @@ def _points(rows: Sequence[Any], limit: Limit | None, threshold_sigma: float) ->
 def _significance(a: Figure, b: Figure) -> float:
     """Of the difference of two figures in standard deviations, two-sided."""
     first, two = (
-        Numbers(figure.name, np.array([figure.value]), np.array([figure.std]), sensor=figure.sensor)
+        ComparedNumbers(figure.name, np.array([figure.value]), np.array([figure.std]), sensor=figure.sensor)
         for figure in (a, b)
     )
     at_same_temperature, std = two.beside(first)

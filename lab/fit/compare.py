@@ -82,7 +82,7 @@ _RULE = re.compile(r"(?:(?P<side>left|right):)?(?P<figure>[^>]+?)\s*(?:>\s*(?P<a
 
 
 @dataclass(frozen=True)
-class Numbers:
+class ComparedNumbers:
     """Values and standard deviations under one name, along `axis` where there is one. `sensor`: of a dark current."""
 
     name: str
@@ -92,7 +92,7 @@ class Numbers:
     axis: Array | None = None
     sensor: SensorTemperature | None = None
 
-    def beside(self, reference: Numbers) -> tuple[Numbers, Array]:
+    def beside(self, reference: ComparedNumbers) -> tuple[ComparedNumbers, Array]:
         """Return the numbers as they would be at the sensor temperature of `reference`, and the standard deviation of
         their difference from it: by the fits, by the lamps' drifts and by the conversion.
 
@@ -195,7 +195,7 @@ def _sidak_whole(p_value: float, number: int) -> float:
     return float(-np.expm1(number * np.log1p(-min(p_value, 1.0 - 1e-16))))
 
 
-def numbers_of(model: Frozen, prefix: str) -> Iterator[tuple[str, Numbers]]:
+def numbers_of(model: Frozen, prefix: str) -> Iterator[tuple[str, ComparedNumbers]]:
     """Yield every fitted number under `model`, by name, each name once. A model in a list is named by its text fields:
     capture, channel, board; by its number, too, where others have the same.
     """
@@ -248,11 +248,11 @@ def sensor_temperature(noise: NoiseFit) -> SensorTemperature:
 
 def _numbers_under(
     name: str, value: Any, std: Any, axis_name: str, axis: Array | None, sensor: SensorTemperature | None = None
-) -> tuple[str, Numbers]:
+) -> tuple[str, ComparedNumbers]:
     """Return a name and its numbers, along `axis` where they are as many as it has."""
     values, stds = np.atleast_1d(np.array(value, dtype=float)), np.atleast_1d(np.array(std, dtype=float))
     along = axis if axis is not None and values.shape == axis.shape else None
-    return name, Numbers(name, values, stds, axis_name if along is not None else "", along, sensor)
+    return name, ComparedNumbers(name, values, stds, axis_name if along is not None else "", along, sensor)
 
 
 def _identity(model: Frozen) -> str:
@@ -261,7 +261,7 @@ def _identity(model: Frozen) -> str:
 
 
 def _compare_numbers(
-    a: dict[str, Numbers], b: dict[str, Numbers], side: Side | None, skipped: list[Skipped]
+    a: dict[str, ComparedNumbers], b: dict[str, ComparedNumbers], side: Side | None, skipped: list[Skipped]
 ) -> Iterator[Change]:
     """Yield the changes of the numbers that both fits have, by name; `skipped` gets the others."""
     alone = {"A": [name for name in a if name not in b], "B": [name for name in b if name not in a]}
@@ -278,19 +278,19 @@ def _compare_numbers(
                 yield from _rows(one, two, side)
 
 
-def _align(a: Numbers, b: Numbers) -> tuple[Numbers, Numbers]:
+def _align(a: ComparedNumbers, b: ComparedNumbers) -> tuple[ComparedNumbers, ComparedNumbers]:
     """Bring both to the axis of A, where that of B covers it."""
     if a.axis is None or b.axis is None or np.array_equal(a.axis, b.axis) or not len(b.axis):
         return a, b
     inside = (a.axis >= b.axis[0]) & (a.axis <= b.axis[-1])
     axis = a.axis[inside]
     return (
-        Numbers(a.name, a.value[inside], a.std[inside], a.axis_name, axis),
-        Numbers(b.name, np.interp(axis, b.axis, b.value), np.interp(axis, b.axis, b.std), a.axis_name, axis),
+        ComparedNumbers(a.name, a.value[inside], a.std[inside], a.axis_name, axis),
+        ComparedNumbers(b.name, np.interp(axis, b.axis, b.value), np.interp(axis, b.axis, b.std), a.axis_name, axis),
     )
 
 
-def _rows(a: Numbers, as_measured: Numbers, side: Side | None) -> Iterator[Change]:
+def _rows(a: ComparedNumbers, as_measured: ComparedNumbers, side: Side | None) -> Iterator[Change]:
     """Yield the rows of one name: one for each number, or that of the largest difference for a curve."""
     b, std_of_difference = as_measured.beside(a)
     parts = (a.value, b.value, a.std, b.std, std_of_difference)
@@ -328,7 +328,7 @@ def _rows(a: Numbers, as_measured: Numbers, side: Side | None) -> Iterator[Chang
         )
 
 
-def title_of(numbers: Numbers, at: int) -> str:
+def title_of(numbers: ComparedNumbers, at: int) -> str:
     """Return the plain name of a number; of a curve or kernel, that of the whole."""
     name = plain_name(numbers.name, place_of(numbers, at) if numbers.value.size <= FEW else "")
     return name if numbers.sensor is None else f"{name} {numbers.sensor.text}"
@@ -340,7 +340,7 @@ def _projection_of(name: str) -> Projection:
     return Projection(kind, 90.0 if kind == "splined_stereographic" else None)  # its names don't depend on the angle
 
 
-def place_of(numbers: Numbers, at: int) -> str:
+def place_of(numbers: ComparedNumbers, at: int) -> str:
     """Say which of the numbers under one name the one at index `at` is: on the axis, by its symbol, or by its index."""
     if numbers.axis is not None:
         quantity, unit = numbers.axis_name.split("_", 1)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.special import erfcx, log_ndtr, ndtr, ndtri
+from scipy.special import erfcx, log_ndtr, logsumexp, ndtr, ndtri
 from scipy.stats import qmc
 
 from lab.inference.hypotheses import Coordinate
@@ -96,7 +96,7 @@ def _normal(
             continue
         d, weight = _along(float(mean[k]), float(np.sqrt(inverse[k, k])), low[k] - u[k], high[k] - u[k])
         away = c.log_prior(u[k] + d) - c.log_prior(float(u[k])) - slope[k] * d + 0.5 * precision[k] * d * d
-        total += float(np.log(np.sum(weight * np.exp(np.minimum(away, 50.0)))))
+        total += float(logsumexp(np.minimum(away, 50.0), b=weight))
     return total, mean, inverse
 
 

@@ -24,7 +24,7 @@ from lab.inference.hypotheses import EffectParameter, Hypothesis, SetPrior, effe
 from lab.inference.model import Group, State
 from lab.inference.search import Search, Table
 from lab.inference.statements.statement import (
-    Change,
+    AffineChange,
     Changes,
     Numbers,
     Restatement,
@@ -74,7 +74,7 @@ class SideModel:
             found.append(effect_at(point, self.parameters[name]))
         return tuple(found)
 
-    def changes(self, state: State) -> tuple[Change, ...]:
+    def changes(self, state: State) -> tuple[AffineChange, ...]:
         """Return the changes of the prediction by the wrong statements of a state."""
         found = []
         for name in sorted(state):

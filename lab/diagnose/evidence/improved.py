@@ -9,7 +9,7 @@ import numpy as np
 
 from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.evidence.causes import Cause
-from lab.diagnose.evidence.laws import Law
+from lab.diagnose.evidence.laws import UnnamedLaw
 from lab.diagnose.evidence.side_table import SideTable, posterior_means, weighted_residual
 from lab.diagnose.outcome.corrections import (
     Correction,
@@ -57,7 +57,7 @@ def improve(
     fit: FitResult | None,
     baseline: CameraFile | None,
     named: Sequence[Cause],
-    without_name: Sequence[Law] = (),
+    without_name: Sequence[UnnamedLaw] = (),
 ) -> Improved:
     """Return the camera with the named effects, and a family's likeliest law, at the mode of their set; its sensitivity
     curves at the posterior mean of their nuisance parameters; and the laws without a name that a state of the camera
@@ -86,7 +86,7 @@ def _camera(
     baseline: CameraFile | None,
     effects: tuple[Effect, ...],
     disturbances: FloatArray,
-    without_name: Sequence[Law],
+    without_name: Sequence[UnnamedLaw],
 ) -> tuple[CameraFile, tuple[Correction, ...]]:
     """Return the camera with these effects and its corrections, and these in words."""
     side, model = reading.side, reading.used

@@ -42,7 +42,7 @@ PLACES_OF: dict[str, tuple[str, str, str]] = {
 
 
 @dataclass(frozen=True)
-class Law:
+class UnnamedLaw:
     """A law without a name: the group whose process it is, how the result lists it, and the effect that acts so; None
     where no state of the camera has it."""
 
@@ -80,9 +80,9 @@ class _Shown:
         return i, j, float(apart[i, j]), float(std[i, j])
 
 
-def laws_of(reading: SideTable) -> tuple[Law, ...]:
+def laws_of(reading: SideTable) -> tuple[UnnamedLaw, ...]:
     """Return the laws without a name, by state the likeliest first."""
-    found: list[Law] = []
+    found: list[UnnamedLaw] = []
     for finding in reading.posterior.findings:
         if finding.kind != "unlisted" or finding.probability < LIKELIER:
             continue
@@ -122,7 +122,7 @@ def _shown(reading: SideTable, delta: Delta, group: int) -> _Shown:
 
 
 @dataclass(frozen=True)
-class _Curve:
+class _ShownCurve:
     """A process as the result lists it: place, points, the law's table there, departures from none with their standard
     deviations in the unit in which they are shown. `curve_of`, `labels`: of one measurement's numbers. `size`: in
     words."""
@@ -140,7 +140,7 @@ class _Curve:
     size: str = ""
 
 
-def _law(reading: SideTable, group: int, delta: Delta, probability: float, others: Sequence[int]) -> Law:
+def _law(reading: SideTable, group: int, delta: Delta, probability: float, others: Sequence[int]) -> UnnamedLaw:
     shown, state = _shown(reading, delta, group), reading.table.groups[group]
     names = tuple(dict.fromkeys(reading.used.blocks[k].measurement.name for k in shown.blocks))
     judged = predict_by_curve(reading.problem, reading.search, reading.table, group, names)
@@ -178,10 +178,12 @@ def _law(reading: SideTable, group: int, delta: Delta, probability: float, other
         told, one.size, list(dict.fromkeys(_axis(reading, g) for g in others)), is_held_out=judged is not None
     )
     is_of_camera = isinstance(curve, StateCurve) and not isinstance(curve, BordersCurve)
-    return Law(group, told.model_copy(update={"statement": said}), curve.law(shown.mean) if is_of_camera else None)
+    return UnnamedLaw(
+        group, told.model_copy(update={"statement": said}), curve.law(shown.mean) if is_of_camera else None
+    )
 
 
-def _of_state(reading: SideTable, curve: StateCurve, shown: _Shown) -> _Curve:
+def _of_state(reading: SideTable, curve: StateCurve, shown: _Shown) -> _ShownCurve:
     """Return a law on a state of the chain, at all its points."""
     gain = reading.used.camera.conversion_gain_dn_per_e
     unit = departure_unit(curve.stage, curve.along, curve.of, bool(curve.at))
@@ -190,12 +192,12 @@ def _of_state(reading: SideTable, curve: StateCurve, shown: _Shown) -> _Curve:
     law = curve.law(shown.mean)
     table = np.array(law.table) if isinstance(law, EmpiricalLaw) else curve.none + change
     size = _size_of_state(curve, shown, factor, unit, reading.used.camera.channels)
-    return _Curve(
+    return _ShownCurve(
         curve.stage, curve.along, curve.of, curve.at, table, factor * change, factor * std, curve.period, size=size
     )
 
 
-def _of_observable(curve: ObservableCurve, shown: _Shown) -> _Curve:
+def _of_observable(curve: ObservableCurve, shown: _Shown) -> _ShownCurve:
     """Return a curve of one measurement's used numbers, in its quantity: by channel and condition, along its axis."""
     measurement, used = curve.measurement, curve.used
     labels = [" ".join(dict.fromkeys((label.channel, label.condition))).strip() for label in curve.labels[:used]]
@@ -204,7 +206,7 @@ def _of_observable(curve: ObservableCurve, shown: _Shown) -> _Curve:
     stage, along, of = PLACES_OF.get(measurement.name, ("image", measurement.axis.replace("_", " "), "mean"))
     at = tuple(curve.labels[k].x for k in order)
     of_each = tuple(labels[k] for k in order)
-    one = _Curve(stage, along, of, at, departure, departure, std, curve_of=measurement.name, labels=of_each)
+    one = _ShownCurve(stage, along, of, at, departure, departure, std, curve_of=measurement.name, labels=of_each)
     return replace(one, size=_size_of_measurement(one))
 
 
@@ -266,7 +268,7 @@ def _size_of_state(
     return f"is {size} higher at {high} than at {low}"
 
 
-def _size_of_measurement(one: _Curve) -> str:
+def _size_of_measurement(one: _ShownCurve) -> str:
     """Say by how much a measurement departs where that is the most standard deviations."""
     k = int(np.argmax(np.abs(one.departure) / np.maximum(one.std, 1e-300)))
     return f"departs by {one.departure[k]:+.3g} ± {one.std[k]:.1g} at {one.at[k]:.4g} ({one.labels[k]})"

@@ -362,7 +362,9 @@ def _verdict(found: Sequence[EvidenceFindings], named: Sequence[_Named]) -> Diag
 
 def _is_whole(findings: EvidenceFindings, named: Sequence[_Named]) -> bool:
     """Return whether a side has no mismatch; or its names hold, nothing unlisted is likelier than not, and the check
-    passed."""
+    passed. No name stands for boards whose corners depart."""
+    if findings.boards_depart:
+        return False
     if findings.nothing > findings.least_nothing and findings.check_passed:
         return True
     here = any(findings.side in one.sides for one in named)

@@ -27,6 +27,7 @@ from lab.diagnose.evidence.places import (
     unresolved,
 )
 from lab.diagnose.evidence.side_table import SideTable, predict_by_baseline
+from lab.diagnose.inference.side_model import measurement_model
 from lab.diagnose.metadata import unchecked
 from lab.diagnose.metadata.stated_light import impossible_efficiency, misstated_light
 from lab.diagnose.outcome.mismatches import board_departure
@@ -85,6 +86,7 @@ class EvidenceFindings:
     is_judged : whether any measurement is determined
     gain_is_known : whether a conversion gain is stated or measured; else electrons are those of 1 DN/e
     said : the side's verdict by itself
+    boards_depart : whether corners depart from the fitted geometry by more than their noise
     check_passed : whether no observable of the held-out captures contradicts the prediction
     nothing, least_nothing : probability that no effect and nothing unlisted acts, and the value that
         `FALSE_ALARM_RATE` of the cameras without any fall short of
@@ -104,6 +106,7 @@ class EvidenceFindings:
     is_judged: bool = False
     gain_is_known: bool = True
     said: Verdict = "unexplained"
+    boards_depart: bool = False
     check_passed: bool = True
     nothing: float = 0.0
     least_nothing: float = 0.0
@@ -143,9 +146,11 @@ def diagnose_side_by_evidence(
     measured, searched = examined.recordings, examined.searched
     metadata = tuple(one.told(side) for one in examined.wrong)
     remarks = tuple(unchecked(measured, side))
-    if searched is None:
-        return EvidenceFindings(side, DiagnosisLists(skipped=remarks, unexplained=metadata), metadata=metadata)
     fit = fits[-1] if fits else None
+    if searched is None:
+        _, lacking = measurement_model(measured, side, fit, baseline)
+        lists = DiagnosisLists(skipped=(*lacking, *remarks), unexplained=metadata)
+        return EvidenceFindings(side, lists, metadata=metadata)
     report("reading the table")
     reading = _read(measured, side, searched)
     return _findings(reading, fit, baseline, metadata, remarks, pictures=pictures, station=station)
@@ -223,6 +228,7 @@ def _findings(
         is_judged=True,
         gain_is_known=reading.used.gain_is_known,
         said=said,
+        boards_depart=departure is not None,
         check_passed=passed,
         nothing=posterior.nothing,
         least_nothing=reading.least_nothing,

@@ -9,7 +9,7 @@ import numpy as np
 from lab.formats.recording_set import RecordingSet
 from lab.inference.hypotheses import Coordinate
 from lab.inference.statements.statement import (
-    Change,
+    AffineChange,
     Changes,
     Numbers,
     Restatement,
@@ -34,7 +34,7 @@ def _restatements(numbers: Numbers) -> Sequence[Restatement]:
 
     def on(numbers: Numbers) -> Changes:
         rows = np.array([k for k, _, _ in numbers.of(BLACK_LEVEL)], int)
-        return lambda u: Change(rows, np.eye(len(rows)), np.full(len(rows), float(u[0])))
+        return lambda u: AffineChange(rows, np.eye(len(rows)), np.full(len(rows), float(u[0])))
 
     def told(recordings: RecordingSet, side: Side, u: FloatArray, std: FloatArray) -> Told:
         black_dn = stated_dn + float(u[0])

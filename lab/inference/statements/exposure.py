@@ -13,7 +13,7 @@ import numpy as np
 from lab.capture_kinds.base import Capture
 from lab.formats.recording_set import RecordingSet
 from lab.inference.hypotheses import Coordinate
-from lab.inference.statements.statement import Change, Changes, Numbers, Restatement, Statement, Told
+from lab.inference.statements.statement import AffineChange, Changes, Numbers, Restatement, Statement, Told
 from lab.observables.darks.level import DARK
 from lab.observables.darks.noise import DARK_NOISE
 from lab.observables.flats.linearity import PHOTON_TRANSFER
@@ -77,11 +77,11 @@ def _on(setting: _Setting, ids: frozenset[str], numbers: Numbers) -> Changes:
     rows = np.concatenate([levels, variances]).astype(int)
     shot_dn2 = noise.gain * noise.dark_dn_per_s * setting[1]
 
-    def change(u: FloatArray) -> Change:
+    def change(u: FloatArray) -> AffineChange:
         more = float(np.expm1(u[0]))
         scale = np.concatenate([np.full(len(levels), 1.0 + more), np.ones(len(variances))])
         offset = np.concatenate([np.full(len(levels), -more * noise.black), np.full(len(variances), more * shot_dn2)])
-        return Change(rows, np.diag(scale), offset)
+        return AffineChange(rows, np.diag(scale), offset)
 
     return change
 

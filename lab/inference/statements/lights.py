@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from lab.formats.recording_set import RecordingSet
-from lab.inference.statements.statement import Change, Changes, Numbers, Restatement, Statement, Told, light_of
+from lab.inference.statements.statement import AffineChange, Changes, Numbers, Restatement, Statement, Told, light_of
 from lab.observables.charts.chart import CHART
 from lab.observables.observable import Measurement
 from lab.observables.spectra.narrowband import NARROWBAND
@@ -70,7 +70,7 @@ def _on(measurement: Measurement, pair: tuple[Hashable, Hashable], numbers: Numb
             share = own_s / other_s / len(there)
             matrix[i, j] += share
             offset[i] -= share * noise.black  # dark current grows with the exposure, as light does
-    change = Change(rows, matrix, offset, spread)
+    change = AffineChange(rows, matrix, offset, spread)
     return lambda u: change
 
 

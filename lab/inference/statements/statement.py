@@ -50,7 +50,7 @@ class Numbers:
 
 
 @dataclass(frozen=True)
-class Change:
+class AffineChange:
     """m' = A m + b of the numbers `rows` (r,), the others as they were. `matrix` (r, r): A; `offset` (r,): b; `spread`
     (r,): standard deviation of what the other value doesn't predict either (a channel that clips there); 0 elsewhere.
     """
@@ -74,7 +74,7 @@ class Change:
 
 
 #: Of some numbers: u (p,) -> change.
-Changes = Callable[[FloatArray], Change]
+Changes = Callable[[FloatArray], AffineChange]
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ def _best(numbers: Numbers, every: Sequence[Restatement]) -> list[Restatement]:
 
 
 def restated(
-    model: MeasurementModel, gaussian: Gaussian, changes: Sequence[Change], effects: Sequence[object]
+    model: MeasurementModel, gaussian: Gaussian, changes: Sequence[AffineChange], effects: Sequence[object]
 ) -> Gaussian:
     """Return the Gaussian of a model under some effects with the changes of wrong statements: of the mean, and of the
     Jacobian by nuisance parameters, which is part of the covariance."""

@@ -6,7 +6,8 @@ it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -17,7 +18,7 @@ from scipy.linalg import block_diag
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
-from lab.observables.codes.even_light import ExpectedCounts, LevelCounts, levels_of
+from lab.observables.codes.even_light import EvenLight, ExpectedCounts, LevelCounts, PatternSum, even_light
 from lab.observables.codes.landings import landings
 from lab.observables.dataset import Dataset, held_out_flats, held_out_of
 from lab.observables.observable import Label, Measurement, Observable, Prediction
@@ -40,6 +41,7 @@ DEGREE_BESIDE = 1
 STEP_COUNT = 3.0  # of each code about a place; the sum over a place has a hundred times as many
 COMB_FLOOR = 3e-4
 VARIANCE_FLOOR = 0.03  # of a chi2's number of codes
+FINE_FRAMES = 8  # frames, at most, over which the fine pattern of a plane is averaged
 #: Frequencies of the combs, cycles a code.
 COMBS = (1 / 2, 3 / 8, 1 / 4, 1 / 8)
 PARTS = 4  # of the range of codes, each with a chi2 of its own
@@ -84,8 +86,7 @@ def measure_code_density(dataset: Dataset) -> Observable:
         floor = np.concatenate([np.zeros(len(steps)), np.full(len(combs), COMB_FLOOR)])
         light = ExpectedCounts.of(counts[held_out].planes, codes.first, len(codes.count))
         covariances += [
-            _covariance(linear, codes, counts[held_out], light, _fixed_share(dataset, codes))
-            + np.diag(np.square(floor)),
+            _covariance(linear, codes, counts[held_out], light) + np.diag(np.square(floor)),
             np.diag([1.0 + (VARIANCE_FLOOR * p.number / p.chi2_std) ** 2 for p in parts]),
         ]
         members = tuple(counts[held_out].captures)
@@ -129,6 +130,23 @@ def measure_code_density(dataset: Dataset) -> Observable:
     )  # fmt: skip
 
 
+_Plane = tuple[str, tuple[int, ...]]  # name of a plane of the mosaic, and its shape
+
+
+@dataclass(frozen=True)
+class _Pattern:
+    """A plane's fine pattern over the mean signal (rows, cols), and the sum of its departures from local means."""
+
+    fine: FloatArray | float
+    sum: PatternSum = field(default_factory=PatternSum)
+
+
+def _planes(dataset: Dataset, capture: Any) -> Iterator[tuple[_Plane, FloatArray]]:
+    """Yield the planes of a capture's frame."""
+    for name, plane in mosaic.planes(dataset.recordings.frame(capture), dataset.camera.cfa).items():
+        yield (name, plane.shape), np.asarray(plane, np.float32)
+
+
 @dataclass(frozen=True)
 class _Counts:
     """Counts of every code in some frames, (white level + 1,), and the counts that light and noise give an ideal
@@ -139,17 +157,25 @@ class _Counts:
     captures: list[str]
     planes: list[list[LevelCounts]]
 
-    def take(self, dataset: Dataset, capture: Any) -> None:
-        """Add a capture's frame."""
+    def take(self, dataset: Dataset, capture: Any, patterns: dict[_Plane, _Pattern]) -> list[tuple[_Plane, EvenLight]]:
+        """Add a capture's frame, and its planes' departures to `patterns`. Return the light of its planes."""
         frame = dataset.recordings.frame(capture)
         self.count[:] += np.bincount(frame.ravel(), minlength=len(self.count))[: len(self.count)]
-        for plane in mosaic.planes(frame, dataset.camera.cfa).values():
-            levels = list(levels_of(np.asarray(plane, np.float32), dataset))
-            for first, number, table in levels:
-                last = min(first + table.shape[1], len(self.expected))
-                self.expected[first:last] += number * table[0, : last - first]
-            self.planes.append(levels)
         self.captures.append(capture.id)
+        found = []
+        for key, plane in _planes(dataset, capture):
+            pattern = patterns.setdefault(key, _Pattern(0.0))
+            light, departures = even_light(plane, dataset, pattern.fine)
+            pattern.sum.add(departures, light.signal_dn)
+            found.append((key, light))
+        return found
+
+    def expect(self, levels: list[LevelCounts]) -> None:
+        """Add a plane's levels to what is expected."""
+        for first, number, table in levels:
+            last = min(first + table.shape[1], len(self.expected))
+            self.expected[first:last] += number * table[0, : last - first]
+        self.planes.append(levels)
 
 
 def counted(dataset: Dataset) -> dict[bool, _Counts]:
@@ -166,10 +192,25 @@ def counted(dataset: Dataset) -> dict[bool, _Counts]:
     out = set(dataset.once(held_out_flats))
     groups = dataset.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
     out |= set().union(*(held_out_of(g, i, len(groups)) for i, g in enumerate(groups))) if groups else set()
-    for kind in (FlatCapture, NarrowbandCapture):
-        for capture in dataset.recordings.captures(kind, dataset.side):
-            if not capture.gain_db:
-                counts[capture.id in out].take(dataset, capture)
+    captures = [
+        capture
+        for kind in (FlatCapture, NarrowbandCapture)
+        for capture in dataset.recordings.captures(kind, dataset.side)
+        if not capture.gain_db
+    ]
+    sums: dict[_Plane, PatternSum] = {}
+    for capture in captures[:: -(-len(captures) // FINE_FRAMES) or 1]:
+        for key, plane in _planes(dataset, capture):
+            sums.setdefault(key, PatternSum()).add_plane(plane, dataset.noise.black)
+    patterns = {key: _Pattern(of.fine()) for key, of in sums.items()}
+    lights = [
+        (counts[capture.id in out], light)
+        for capture in captures
+        for light in counts[capture.id in out].take(dataset, capture, patterns)
+    ]
+    distributions = {key: pattern.sum.distribution() for key, pattern in patterns.items()}
+    for own, (key, light) in lights:
+        own.expect(list(light.levels(distributions[key])))
     return counts
 
 
@@ -234,40 +275,31 @@ def _smoothing(half: int) -> FloatArray:
     return np.asarray(np.linalg.pinv(np.vander(x, DEGREE + 1, increasing=True))[0])
 
 
-def _covariance(
-    linear: FloatArray, codes: CodeHistogram, counts: _Counts, light: ExpectedCounts, fixed: float
-) -> FloatArray:
+def _covariance(linear: FloatArray, codes: CodeHistogram, counts: _Counts, light: ExpectedCounts) -> FloatArray:
     """Return the covariance (m, m) of `linear` (m, codes) @ counts less what is expected.
 
-    Each pixel has one code: the counts of a level's pixels are multinomial. What is expected has its local means and
-    each plane's mean square from the same pixels: it follows the counts of neighbouring levels along z, and those of a
-    plane along z^2 - 1. Both parts of the counts' noise cancel: of temporal noise. A fixed pattern is the same in all
-    frames, so that its counts scatter more than multinomial ones; its share of the two parts stays, as an upper bound
-    for narrow patterns."""
+    Each pixel has one code, with probabilities of its level and its fixed pattern: the counts are a sum of multinomial
+    ones. What is expected has its local means and each plane's mean square from the same pixels: it follows the counts
+    of neighbouring levels with their mean, and those of a plane with their mean square. These parts of the counts'
+    noise cancel, but for what the latter two differ in."""
     covariance = (linear * np.maximum(codes.expected, 1.0)) @ linear.T
     taken = [
-        linear[:, first : first + len(direction)] @ direction
+        linear[:, first : first + directions.shape[1]] @ directions.T
         for levels in counts.planes
-        for first, direction in (_scatter_of(level, codes) for level in levels)
+        for first, directions in (_scatter_of(level, codes) for level in levels)
     ]
-    temporal = np.sqrt(1.0 - fixed)
-    table = np.concatenate([np.array(taken).T, *(temporal * (linear @ light.followed(row)) for row in (1, 2))], axis=1)
-    return covariance - table @ table.T
-
-
-def _fixed_share(dataset: Dataset, codes: CodeHistogram) -> float:
-    """Share of the pixels' variance about their local means that is a fixed pattern, over all counted pixels."""
-    signal = codes.first + np.arange(len(codes.count)) - dataset.noise.black
-    fixed_dn2 = np.square(dataset.noise.prnu * signal)
-    return float(np.average(fixed_dn2 / (fixed_dn2 + np.square(codes.noise)), weights=codes.count))
+    table = np.concatenate([*taken, *(linear @ light.followed(row) for row in (3, 4))], axis=1)
+    brought = linear @ light.followed(5)
+    return covariance - table @ table.T + brought @ brought.T
 
 
 def _scatter_of(level: LevelCounts, codes: CodeHistogram) -> tuple[int, FloatArray]:
-    """Return a level's probabilities times the root of its pixels' number: the index of the first code in `codes`, and
-    the values."""
+    """Return a level's probabilities, and how they vary with the fixed pattern, times the root of its pixels' number:
+    the index of the first code in `codes`, and the values (n, codes)."""
     low = max(level.first, codes.first)
     high = max(min(level.first + level.table.shape[1], codes.first + len(codes.count)), low)
-    return low - codes.first, np.sqrt(level.number) * level.table[0, low - level.first : high - level.first]
+    rows = level.table[[0, *range(6, len(level.table))], low - level.first : high - level.first]
+    return low - codes.first, np.sqrt(level.number) * rows
 
 
 def _combs(codes: CodeHistogram) -> tuple[FloatArray, list[tuple[float, str]]]:

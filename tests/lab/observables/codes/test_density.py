@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from evaluation.draw import recordings_of
 from evaluation.independent_simulator import ConcealedCamera, Law, Plan
@@ -18,6 +19,7 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.observables.charts.chart import measure_chart
 from lab.observables.codes.density import measure_code_density
+from lab.observables.codes.even_light import NO_PATTERN, EvenLight, FixedPattern
 from lab.observables.codes.landings import widths
 from lab.observables.darks.level import measure_dark
 from lab.observables.dataset import Dataset
@@ -46,6 +48,51 @@ def test_even_converters_show_nothing(seed: int) -> None:
     assert chi2 < 1.0 + 3.0 * np.sqrt(2.0 / len(block.value))
     model = MeasurementModel((block,), dataset.camera)
     assert not mismatches(model, model.gaussian(), DecisionPolicy())
+
+
+def test_a_wave_with_normal_noise_is_spread_as_both() -> None:
+    """A wave of half of the variance has -1.5 / 4 of excess kurtosis with normal noise; bins of a fifth of its standard
+    deviation are off by 0.2^2 / 12 of it, which their own mean square makes up, and the noise takes the rest. Without a
+    pattern the distribution is normal, and so is what its mean square moves: half of its second derivative, twice."""
+    wave = FixedPattern(0.01 * np.sqrt(2.0) * np.sin(2.0 * np.pi * np.arange(5000) / 5000))
+    assert wave.variance == pytest.approx(1e-4, rel=0.2**2 / 6.0)
+    z = np.linspace(-6.5, 6.5, 2001)
+    share = np.diff(wave.shape(0.5)(z)[:, 0])
+    at = 0.5 * (z[1:] + z[:-1])
+    moments = [float(share @ at**k) for k in (0, 1, 2, 4)]
+    assert moments == pytest.approx([1.0, 0.0, 1.0, 3.0 - 1.5 / 4.0], abs=5e-3)
+    light = EvenLight(np.ones(1), np.array([1000.0]), np.zeros(1), 1000.0, 200.0, 60.0, 0.1, black_dn=0.0)
+    assert wave.rest_variance(light) == pytest.approx(100.0, rel=5e-3)
+    normal = NO_PATTERN.shape(0.0)(z).T
+    np.testing.assert_allclose(normal[0], ndtr(z), atol=1e-5)
+    np.testing.assert_allclose(normal[4], normal[2] / np.sqrt(2.0), atol=1e-5)
+    np.testing.assert_allclose(normal[5:], 0.0, atol=1e-5)
+
+
+def test_a_fixed_pattern_is_no_step_of_the_converter() -> None:
+    """Sensitivities as a wave of 5 by 7 pixels and 1.5 %, and one pixel in a thousand down by up to 30 %, on even
+    converters: departures from local means have an excess kurtosis near -0.5, and defects. chi2 of n numbers over n: 1
+    within 3 sqrt(2 / n) above; a step of 4 DN on the same pattern is as large as predicted, within 3.5 standard
+    uncertainties."""
+    seed, rows, cols = 772302, 192, 256
+    row, col = np.mgrid[:rows, :cols]
+    pattern = 1.0 + 0.015 * np.sin(2.0 * np.pi * (row / 5.3 + col / 7.1))
+    rng = np.random.default_rng(5)
+    at = rng.integers(0, rows, 50), rng.integers(0, cols, 50)
+    pattern[at] *= rng.uniform(0.7, 1.0, 50)
+    for laws in ((), (AdcNonlinearityLaw(4.0, 0, 2),)):
+        camera = ConcealedCamera(seed, laws, cfa="MONO", rows=rows, cols=cols)
+        camera.prnu_map = pattern
+        block = measure_code_density(dataset(recordings_of(camera, Plan(("dark", "flat")))))
+        told = block.predict(tuple(effect("adc_nonlinearity")(error_dn=law.signed_strength) for law in laws)).mean
+        rest = block.value - told
+        if not laws:
+            assert rest @ np.linalg.solve(block.covariance, rest) / len(rest) < 1.0 + 3.0 * np.sqrt(2.0 / len(rest))
+            continue
+        middle = [i for i, label in enumerate(block.labels) if label.channel == "step" and label.x == 2048.0]
+        assert middle
+        assert np.all(np.abs(told[middle]) > 5.0 * np.sqrt(np.diag(block.covariance)[middle]))
+        assert np.all(np.abs(rest[middle]) < 3.5 * np.sqrt(np.diag(block.covariance)[middle]))
 
 
 @pytest.mark.parametrize("step_dn", [0.0, 3.0])
