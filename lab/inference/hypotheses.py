@@ -174,17 +174,23 @@ class SetPrior:
         with np.errstate(divide="ignore"):
             return np.asarray(np.log(symmetric(list(self.weight.values()), len(self.number) - 1)))
 
+    @cached_property
+    def _of_number(self) -> FloatArray:
+        """Probabilities of so many members: no set has more than there are hypotheses."""
+        known = np.array(self.number) * np.isfinite(self._log_totals)
+        return np.asarray(known / known.sum())
+
     def scale(self, k: int) -> float:
         """Return the prior of a set of k members over the product of their shares; 0 where there is no such set."""
         total = float(self._log_totals[k])
-        return float(self.number[k] * np.exp(-total)) if np.isfinite(total) else 0.0
+        return float(self._of_number[k] * np.exp(-total)) if np.isfinite(total) else 0.0
 
     def log(self, members: frozenset[str]) -> float:
         """Log prior probability of exactly this set; -inf of more members than `number` has."""
         k = len(members)
         if k >= len(self.number):
             return -np.inf
-        return float(np.log(self.number[k]) + sum(np.log(self.weight[m]) for m in members) - self._log_totals[k])
+        return float(np.log(self._of_number[k]) + sum(np.log(self.weight[m]) for m in members) - self._log_totals[k])
 
     def draw(self, rng: np.random.Generator) -> frozenset[str]:
         """Draw a set."""

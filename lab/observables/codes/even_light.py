@@ -53,7 +53,7 @@ class LevelCounts(NamedTuple):
     table: FloatArray
 
 
-class FixedPattern:
+class SensitivityPattern:
     """Distribution of pixels' own sensitivities about the local mean, the same in all frames of a plane.
 
     It is that of the pixels' mean departures over frames, over the mean signal. What noise these means have is normal,
@@ -131,7 +131,7 @@ def _normal(z: FloatArray) -> FloatArray:
 
 
 #: Of pixels that are all alike, or whose pattern isn't known: their departures are taken as normal.
-NO_PATTERN = FixedPattern(np.zeros(1))
+NO_PATTERN = SensitivityPattern(np.zeros(1))
 
 
 @dataclass
@@ -156,11 +156,11 @@ class PatternSum:
         own = plane - shading(plane)
         self.add(own - own.mean(axis=1, keepdims=True), max(float(plane.mean()) - black_dn, 1.0))
 
-    def distribution(self) -> FixedPattern:
+    def distribution(self) -> SensitivityPattern:
         """Return the pixels' distribution; that of pixels that are all alike from too few frames."""
         if self.number < LEAST_FRAMES:
             return NO_PATTERN
-        return FixedPattern(np.asarray(self.departures, float).ravel() / self.signal_dn)
+        return SensitivityPattern(np.asarray(self.departures, float).ravel() / self.signal_dn)
 
     def fine(self) -> FloatArray | float:
         """Return what all frames have finer than local means, over the mean signal (rows, cols); 0 of too few.
@@ -193,7 +193,7 @@ class EvenLight:
     gain: float
     black_dn: float
 
-    def levels(self, pattern: FixedPattern) -> Iterator[LevelCounts]:
+    def levels(self, pattern: SensitivityPattern) -> Iterator[LevelCounts]:
         """Yield the pixels by level, of a plane with a fixed pattern.
 
         The variance gives the measured mean square of the departures: so much are the codes spread about local means,

@@ -19,7 +19,7 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.observables.charts.chart import measure_chart
 from lab.observables.codes.density import measure_code_density
-from lab.observables.codes.even_light import NO_PATTERN, EvenLight, FixedPattern
+from lab.observables.codes.even_light import NO_PATTERN, EvenLight, SensitivityPattern
 from lab.observables.codes.landings import widths
 from lab.observables.darks.level import measure_dark
 from lab.observables.dataset import Dataset
@@ -54,7 +54,7 @@ def test_a_wave_with_normal_noise_is_spread_as_both() -> None:
     """A wave of half of the variance has -1.5 / 4 of excess kurtosis with normal noise; bins of a fifth of its standard
     deviation are off by 0.2^2 / 12 of it, which their own mean square makes up, and the noise takes the rest. Without a
     pattern the distribution is normal, and so is what its mean square moves: half of its second derivative, twice."""
-    wave = FixedPattern(0.01 * np.sqrt(2.0) * np.sin(2.0 * np.pi * np.arange(5000) / 5000))
+    wave = SensitivityPattern(0.01 * np.sqrt(2.0) * np.sin(2.0 * np.pi * np.arange(5000) / 5000))
     assert wave.variance == pytest.approx(1e-4, rel=0.2**2 / 6.0)
     z = np.linspace(-6.5, 6.5, 2001)
     share = np.diff(wave.shape(0.5)(z)[:, 0])
