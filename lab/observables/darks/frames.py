@@ -35,6 +35,7 @@ from sim.spectrum import FloatArray
 TEMPERATURE_STEP_C = 1.0  # dark frames whose temperatures differ by no more are repeats
 CELLS = 4, 6  # of a frame: rows, columns
 LEAST_CELL_PX = 2  # least side of a cell
+THIRD_CODE = 0.02  # share of the variance of two codes beyond which pixels have a third
 MOST_CONDITIONS = 3  # conditions whose fixed pattern is measured: the shortest, the longest, the warmest
 #: Lower edges of the bins in which outlying pixels are counted, in standard deviations of a pixel's fixed pattern. The
 #: first two count dark pixels as well, below their negatives.
@@ -364,7 +365,8 @@ def too_coarse(frames: Sequence[DarkStatistics], limit_dn: float) -> str:
 
 def spread_dn2(frames: Sequence[DarkStatistics], step_dn: float) -> FloatArray:
     """Return the variance (conditions,) of pixels about their frame's mean before rounding to `step_dn`, by temporal
-    noise and fixed pattern, DN^2. The pattern is the smallest one of the conditions."""
+    noise and fixed pattern, DN^2. The pattern is the smallest one of the conditions. Of pixels at two codes alone it
+    may be anything small, and is taken as 0: at a share p of one of them they have the variance p (1 - p)."""
     patterns = [
         max(part.white_dn2 - f.changing[out].white_dn2 / part.frames, 0.0)
         for f in frames
@@ -375,8 +377,11 @@ def spread_dn2(frames: Sequence[DarkStatistics], step_dn: float) -> FloatArray:
     for f in frames:
         moving = next((c.variance_dn2 for c in f.changing.values()), None)
         single = min((part.white_dn2 for part in f.fixed.values()), default=0.0)  # one frame has both
-        found.append(single if moving is None else moving + pattern)
-    return np.maximum(np.array(found) - QUANTISATION_DN2 * step_dn**2, 0.0)
+        total = single if moving is None else moving + pattern
+        share = float(np.mean(list(f.means.values()))) / step_dn % 1.0
+        has_third_code = total > (1.0 + THIRD_CODE) * share * (1.0 - share) * step_dn**2
+        found.append(total - QUANTISATION_DN2 * step_dn**2 if has_third_code else 0.0)
+    return np.maximum(np.array(found), 0.0)
 
 
 def rounding_waves_of_change_dn(change_dn: FloatArray, std_dn: float, step_dn: float) -> list[FloatArray]:

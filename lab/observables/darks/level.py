@@ -61,12 +61,19 @@ def measure_dark(dataset: Dataset) -> Observable:
     """Mean of every dark frame without defective pixels, DN.
 
     Nuisance parameters: black level and dark current. Effects may add an offset that drifts with time or temperature,
-    dark current, image lag, and the converter's error at these codes. Raises NotDetermined without dark captures."""
+    dark current, image lag, and the converter's error at these codes. Raises NotDetermined without dark captures, and
+    where most pixels are at code 0."""
     frames = dataset.once(dark_frames)
     captures = [(c, f.condition, c in f.condition.held_out) for f in frames for c in f.condition.captures]
     value = np.array([f.means[c.id] for f in frames for c in f.condition.captures])
     exposures = np.array([c.exposure_s for c, *_ in captures])
     noise, gain = dataset.noise, dataset.noise.gain
+    if value.min() < 0.5 * noise.step_dn:
+        raise NotDetermined(
+            "dark",
+            f"dark frames have a mean of {value.min():.2g} DN: most pixels are at code 0, and their mean doesn't "
+            "follow the signal; raise the black level to 5 DN or more",
+        )
     base = noise.black + noise.dark_dn_per_s * exposures
     lines = LineMeans(dataset, [(c, None) for c, *_ in captures])
 

@@ -23,7 +23,7 @@ from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.darks import defective_pixels
 from lab.observables.darks import noise as dark_noise
-from lab.observables.darks.frames import TAIL_EDGES, DarkCondition
+from lab.observables.darks.frames import TAIL_EDGES, DarkCondition, dark_frames, spread_dn2
 from lab.observables.darks.level import measure_dark
 from lab.observables.darks.readout import measure_dark_correlation, measure_fixed_lines
 from lab.observables.dataset import Dataset
@@ -445,3 +445,31 @@ def test_a_hot_pixel_does_not_move_the_mean_of_a_small_frame(seed: int) -> None:
     free = np.array(list(prediction.jacobian.values()))
     n = len(block.value)
     assert chi2(block.value - prediction.mean, block.covariance + free.T @ free) < n + 4.0 * np.sqrt(2.0 * n)
+
+
+def test_dark_frames_at_code_0_have_no_level() -> None:
+    """The black level is clipped: the mean that is left doesn't follow the signal."""
+    recordings = _sim_darks(11)
+    shift = int(np.mean(recordings.frame(recordings.manifest.captures[0]))) + 5
+    frames = {
+        c.frame: np.maximum(np.asarray(recordings.frame(c), int) - shift, 0).astype(np.uint16)
+        for c in recordings.manifest.captures
+        if c.exposure_s < 1.0
+    }
+    content = recordings.manifest.model_dump(mode="json")
+    content["captures"] = [c for c in content["captures"] if c["frame"] in frames]
+    _, _, refused = _blocks(RecordingSet(Manifest.model_validate(content), frames, {}, {}))
+    assert "most pixels are at code 0" in refused["dark"]
+
+
+@pytest.mark.parametrize(("offset", "noise_dn"), [(0.75, 0.05), (0.5, 0.1), (0.1, 0.02)])
+def test_pixels_at_two_codes_do_not_tell_their_noise(offset: float, noise_dn: float) -> None:
+    """The variance of two codes is p (1 - p) whatever the noise: the mean is off by rounding as by a code's width."""
+    recordings, rng = _sim_darks(12), np.random.default_rng(12)
+    frames = {
+        c.frame: np.floor(100.0 + offset + noise_dn * rng.standard_normal((ROWS, COLS)) + 0.5).astype(np.uint16)
+        for c in recordings.manifest.captures
+    }
+    coarse = RecordingSet(recordings.manifest, frames, {}, {})
+    found = Dataset(coarse, "left", camera_model(coarse, "left"))
+    np.testing.assert_array_equal(spread_dn2(found.once(dark_frames), 1.0), 0.0)
