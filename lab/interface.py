@@ -186,12 +186,13 @@ def diagnose(
     progress : show a bar; None: on a terminal and in a notebook
 
     Returns the verdict, the effects with their probabilities and parameters, and how much better held-out captures are
-    predicted. `evaluate` returns the improved cameras, too. Raises InputError.
+    predicted; a family, as `line_noise`, where several of its effects explain the recordings as well. `evaluate`
+    returns the improved cameras, too. Raises InputError.
 
     >>> import calibench
     >>> diagnosis = calibench.diagnose("my-camera")
     >>> sorted(effect.name for effect in diagnosis.effects)
-    ['column_noise', 'row_noise']
+    ['column_noise', 'line_noise']
     """
     from lab.pipeline import PipelineRequest
 
