@@ -195,8 +195,7 @@ class SetPrior:
     def draw(self, rng: np.random.Generator) -> frozenset[str]:
         """Draw a set."""
         names = list(self.weight)
-        number = np.array(self.number[: len(names) + 1])  # no set has more members
-        k = int(rng.choice(len(number), p=number / number.sum()))
+        k = int(rng.choice(len(self.number), p=self._of_number))
         sets = list(combinations(names, k))
         if len(sets) > 20000:
             raise ValueError(f"{len(sets)} sets of {k} hypotheses: draw from 20000 at most, of a toy's hypotheses")

@@ -34,26 +34,23 @@ class AlternatingRows:
         """Return the variance of a pixel."""
         return self.noise_e**2
 
-    def _of_row_e2(self, frequency_cy_per_px: FloatArray) -> FloatArray:
-        """Expected periodogram of a row: that of a constant of cols / 2 pixels at twice the frequency."""
+    def spectrum_e2(self, frequency_cy_per_px: FloatArray) -> FloatArray:
+        """Power at frequencies in reading order, e^2; its mean over -0.5..0.5 cy/px is the variance. It is the expected
+        periodogram of a row: that of a constant of cols / 2 pixels at twice the frequency."""
         half = self.cols // 2
         turn = 2.0 * np.asarray(frequency_cy_per_px, float)
         away = turn - np.rint(turn)
         return np.asarray(self.noise_e**2 * half * np.square(np.sinc(half * away) / np.sinc(away)))
 
-    def spectrum_e2(self, frequency_cy_per_px: FloatArray) -> FloatArray:
-        """Power at frequencies in reading order, e^2; its mean over -0.5..0.5 cy/px is the variance."""
-        return self._of_row_e2(frequency_cy_per_px)
-
     def plane_e2(self, shape: tuple[int, int], across_cy_per_px: FloatArray, down_cy_per_px: FloatArray) -> FloatArray:
         """Expected periodogram |FFT|^2 / pixels of a frame (rows, cols) at frequencies across the columns and down the
         rows, which broadcast: level down the rows."""
         across, _ = np.broadcast_arrays(np.asarray(across_cy_per_px, float), np.asarray(down_cy_per_px, float))
-        return self._of_row_e2(across)
+        return self.spectrum_e2(across)
 
     def along_rows_e2(self, shape: tuple[int, int], across_cy_per_px: FloatArray) -> FloatArray:
         """Mean over all rows of their expected periodograms, at frequencies across the columns."""
-        return self._of_row_e2(across_cy_per_px)
+        return self.spectrum_e2(across_cy_per_px)
 
     def along_columns_e2(self, shape: tuple[int, int], down_cy_per_px: FloatArray) -> FloatArray:
         """Mean over the waves across the columns, of 1 to cols / 2 cycles, of a frame's periodogram at frequencies down

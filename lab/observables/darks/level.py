@@ -72,7 +72,7 @@ def measure_dark(dataset: Dataset) -> Observable:
         raise NotDetermined(
             "dark",
             f"dark frames have a mean of {value.min():.2g} DN: most pixels are at code 0, and their mean doesn't "
-            "follow the signal; raise the black level to 5 DN or more",
+            "follow the signal; raise the black level until few pixels are at code 0",
         )
     base = noise.black + noise.dark_dn_per_s * exposures
     lines = LineMeans(dataset, [(c, None) for c, *_ in captures])
