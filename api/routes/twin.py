@@ -28,7 +28,7 @@ from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
 from lab.formats.result_file import read_result
 from lab.twin.budget import BudgetResult, budget, parse_uses
-from lab.twin.changes import checked_changes
+from lab.twin.changes import validate_changes
 from lab.twin.predict import predict
 from lab.twin.score import TwinScore, score
 from lab.twin.sealed import SealedPrediction, open_seal, seal, seal_path
@@ -99,7 +99,7 @@ def _fields(service: Service, prediction_id: str, prediction: SealedPrediction) 
 def make_prediction(service: Here, asked: PredictionStart, response: Response) -> StoredPrediction:
     """Predict the measured numbers of a session that hasn't been captured, with their covariance, and seal them, as
     `calibench twin predict` does. 422, in one line, for a change that the model can't carry."""
-    changes = checked_changes(asked.changes.model_dump(exclude_none=True), "changes.")
+    changes = validate_changes(asked.changes.model_dump(exclude_none=True), "changes.")
     models = camera_models.camera_files(service.store, camera_model(service, asked.camera_model))
     plan_id, plan = _set(service, asked.plan)
     fitted = None if asked.fitted is None else _read(_set(service, asked.fitted)[1])
