@@ -46,8 +46,8 @@ class StoredEffect(Frozen):
 
     def effect(self) -> Effect:
         """Return the effect. Raises ValueError for one that the library doesn't have."""
-        found: Effect = library_effect(self.name).model_validate(self.values)
-        return found
+        acting: Effect = library_effect(self.name).model_validate(self.values)
+        return acting
 
 
 class RivalModel(Frozen):
@@ -111,7 +111,7 @@ class ModelPosterior(Frozen):
         known = {name: i for i, name in enumerate(self.names)}
         mean, covariance = np.zeros(len(names)), np.eye(len(names))
         at = [i for i, name in enumerate(names) if name in known]
-        here = [known[names[i]] for i in at]
-        mean[at] = np.array(self.mean)[here]
-        covariance[np.ix_(at, at)] = np.array(self.covariance).reshape(len(known), -1)[np.ix_(here, here)]
+        places = [known[names[i]] for i in at]
+        mean[at] = np.array(self.mean)[places]
+        covariance[np.ix_(at, at)] = np.array(self.covariance).reshape(len(known), -1)[np.ix_(places, places)]
         return mean, covariance

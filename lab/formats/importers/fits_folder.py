@@ -71,11 +71,11 @@ def _listed(path: Path) -> tuple[list[Path], list[str]]:
     subfolders. Raises InputError where there are none."""
     files = sorted(file for file in path.iterdir() if is_fits(file))
     inner = sorted(file for file in path.rglob("*") if file.parent != path and is_fits(file) and file.is_file())
-    found = Counter(file.parent.relative_to(path).as_posix() for file in inner)
-    folders = ", ".join(f"{name} ({number})" for name, number in found.items())
+    frames_of_folder = Counter(file.parent.relative_to(path).as_posix() for file in inner)
+    folders = ", ".join(f"{name} ({number})" for name, number in frames_of_folder.items())
     if files:
-        told = f"{path}: frames in its subfolders are left out: {folders}; move them here, or write {INDEX}"
-        return files, [told] if inner else []
+        remark = f"{path}: frames in its subfolders are left out: {folders}; move them here, or write {INDEX}"
+        return files, [remark] if inner else []
     if not inner:
         raise InputError(
             f"{path}: no FITS frames ({', '.join(FITS)}, also with {', '.join(PACKED)}); give their folder"

@@ -46,7 +46,7 @@ from lab.formats.importers.images import (
     readout,
 )
 from lab.formats.importers.own_statements import compare_with_files, known_from_file, taken_from_file
-from lab.formats.importers.stated_settings import frame_header, held_against_frames
+from lab.formats.importers.stated_settings import check_against_frames, frame_header
 from lab.formats.pictures import IMAGES, TIFFS, picture_facts, read_picture
 from lab.formats.recording_set import DataSheet, Manifest, RecordingError, RecordingSet, parse_manifest
 from lab.formats.recording_set.files import locate_as_written
@@ -80,8 +80,8 @@ def read_index(file: Path, needed: tuple[str, ...] = ("frame", "kind")) -> Index
     if not file.is_file():
         raise InputError(f"{file}: missing; write one row a capture: {wanted},...")
     try:
-        found = read_foreign_csv(file)
-        reader = csv.reader(found.text.splitlines())
+        text = read_foreign_csv(file)
+        reader = csv.reader(text.text.splitlines())
         header = [cell.strip() for cell in next(reader, [])]
         listed = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except csv.Error as error:
@@ -99,7 +99,7 @@ def read_index(file: Path, needed: tuple[str, ...] = ("frame", "kind")) -> Index
         rows.append((number, cells))
     if not rows:
         raise InputError(f"{file}: lists no captures; write one row a capture")
-    remarks = [f"{file}: {remark}" for remark in found.remarks]
+    remarks = [f"{file}: {remark}" for remark in text.remarks]
     if unused:
         remarks.append(f"{file}: columns that no capture has are left out: {', '.join(unused)}")
     return Index(rows, tuple(remarks))
@@ -112,8 +112,8 @@ def _check_header(file: Path, header: list[str], needed: tuple[str, ...]) -> lis
     unknown = [name for name in header if name and name not in known]
     meant = [(name, near) for name in unknown if (near := nearest_name(name, known)) is not None and near not in header]
     if meant:
-        told = "; ".join(f"'{name}': write {in_its_unit(near)}" for name, near in meant)
-        raise InputError(f"{file}: unknown column {told}")
+        corrections = "; ".join(f"'{name}': write {in_its_unit(near)}" for name, near in meant)
+        raise InputError(f"{file}: unknown column {corrections}")
     missing = [f"'{name}'" for name in needed if name not in header]
     if missing:
         raise InputError(
@@ -200,9 +200,9 @@ def recordings_of_index(
     taps: dict[Side, tuple[Tap, ...]] = {}
     for side, keys in described_sides(cameras).items():
         listed = parse_taps(keys.get("taps", ()), str(cameras))
-        taps[side] = tuple(one for one in listed if one.name == tap) if tap else listed
+        taps[side] = tuple(tap_of_side for tap_of_side in listed if tap_of_side.name == tap) if tap else listed
         if tap and not taps[side]:
-            names = ", ".join(one.name for one in listed) or "none"
+            names = ", ".join(tap_of_side.name for tap_of_side in listed) or "none"
             raise InputError(f"--tap {tap}: {cameras} describes no such tap of the {side} camera; it has {names}")
     remarks = tuple(f"{cameras}: {remark}" for remark in read_foreign_text(cameras).remarks)
     index = _of_choice(path, replace(index, remarks=index.remarks + remarks), where, choice)
@@ -227,10 +227,10 @@ def _of_choice(path: Path, index: Index, where: str, choice: HeaderChoice) -> In
         if file not in stated or is_chosen(choice, row.get("kind", ""), settings.get(file, {}))
     ]
     for keyword, wanted in choice.only:
-        there = {text_of(own[keyword]) for own in settings.values() if keyword in own}
-        if not any(states(own, keyword, wanted) for own in settings.values()):
-            found = f"they state {', '.join(sorted(there))}" if there else "none states it"
-            raise InputError(f"--only {keyword}={wanted}: no frame's header states that, {found}; correct it")
+        there = {text_of(header[keyword]) for header in settings.values() if keyword in header}
+        if not any(states(header, keyword, wanted) for header in settings.values()):
+            offered = f"they state {', '.join(sorted(there))}" if there else "none states it"
+            raise InputError(f"--only {keyword}={wanted}: no frame's header states that, {offered}; correct it")
     option = ",".join("=".join(pair) for pair in choice.only)
     if not kept:
         raise InputError(f"{where}: no frame's header states all of {option} (--only); give one of them")
@@ -335,8 +335,8 @@ def _recording_set(
     readouts: dict[Side, Readout] = {}
     for side, own_taps in taps.items():
         if own_taps and side in measured:
-            own = [images[capture["frame"]] for capture in captures if capture["side"] == side]
-            cut = readout(own_taps, own, (measured[side]["rows"], measured[side]["cols"]), str(path / CAMERA))
+            files_of_side = [images[capture["frame"]] for capture in captures if capture["side"] == side]
+            cut = readout(own_taps, files_of_side, (measured[side]["rows"], measured[side]["cols"]), str(path / CAMERA))
             measured[side] |= {"rows": cut.shape[0], "cols": cut.shape[1], "black_level_dn": cut.black_level_dn}
             for key in ("cfa", "black_level_dn"):  # of the whole sensor
                 if known[side].pop(key, None) is not None and key == "cfa":
@@ -361,9 +361,9 @@ def _recording_set(
     except RecordingError as error:
         raise RecordingError(_by_row(error.problems, numbers)) from error
     warnings = _by_row(warnings, numbers)
-    remarks += [remark for one in readouts.values() for remark in one.remarks]
+    remarks += [remark for side_readout in readouts.values() for remark in side_readout.remarks]
     remarks += remarks_on(path, _spectra(manifest))
-    manifest, said = held_against_frames(manifest, images, where, choice)
+    manifest, said = check_against_frames(manifest, images, where, choice)
     remarks += said
     statements = described_sides(path / CAMERA)
     for side, camera in described.items():
@@ -420,12 +420,12 @@ def _listed_frames(path: Path, index: Index, where: str) -> _ListedFrames:
         for page in range(many):
             name = _unused(stem if many == 1 else f"{stem}-p{page + 1}", used)
             frame = f"frames/{name}.npy"
-            own = {"id": name, "side": "left", "exposure_s": None} | capture | {"frame": frame}
+            keys = {"id": name, "side": "left", "exposure_s": None} | capture | {"frame": frame}
             if many > 1:
                 listed.pages[frame] = page
-                own |= {"id": name} | ({"pose": f"{capture['pose']}-p{page + 1}"} if "pose" in capture else {})
-                own.pop("time", None)  # of one page, and which isn't known
-            listed.captures.append(own)
+                keys |= {"id": name} | ({"pose": f"{capture['pose']}-p{page + 1}"} if "pose" in capture else {})
+                keys.pop("time", None)  # of one page, and which isn't known
+            listed.captures.append(keys)
             listed.images[frame] = file
             listed.numbers.append(number)
     if problems:
@@ -442,7 +442,7 @@ def _unused(name: str, used: set[str]) -> str:
     """Return the name, with the first number behind it that makes it a new one where it is used; it is used from now
     on."""
     numbered = (name if number == 1 else f"{name}-{number}" for number in count(1))
-    free = next(one for one in numbered if one not in used)
+    free = next(candidate for candidate in numbered if candidate not in used)
     used.add(free)
     return free
 
@@ -456,16 +456,16 @@ def _pages(file: Path) -> int:
 
 def _by_row(lines: Sequence[str], numbers: Sequence[int]) -> list[str]:
     """Lines on captures as lines on their rows, one for all rows of which the same is said."""
-    found: dict[tuple[str, str], list[str]] = {}
+    rows_of_line: dict[tuple[str, str], list[str]] = {}
     for line in lines:
         parts = re.fullmatch(r"(.*: )captures\[(\d+)\]( \(.*?\))?(: .*)", line, re.S)
         key, row = (
             ((parts[1], parts[4]), f"row {numbers[int(parts[2])]}{parts[3] or ''}") if parts else ((line, ""), "")
         )
-        found.setdefault(key, []).append(row)
+        rows_of_line.setdefault(key, []).append(row)
     return [
         f"{before}{of[0]}{f' and {len(of) - 1} more' if len(of) > 1 else ''}{after}"
-        for (before, after), of in found.items()
+        for (before, after), of in rows_of_line.items()
     ]
 
 
