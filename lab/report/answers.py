@@ -68,19 +68,19 @@ def _from_zero(value: ParameterValue, quantity: Quantity | None) -> str:
 def odds(diagnosis: DiagnosisResult | None) -> list[tuple[Side, list[tuple[str, float]]]]:
     """Return the probabilities of the models by side: the likeliest sets of effects, none further acting, and all the
     rest; and the rivals, where these aren't among the sets."""
-    found = []
-    for one in diagnosis.models if diagnosis is not None else ():
-        shown = one.sets[:ODDS]
+    likeliest_sets = []
+    for models in diagnosis.models if diagnosis is not None else ():
+        shown = models.sets[:ODDS]
         rows = [(set_in_words(item), item.probability) for item in shown]
         has_unlisted = diagnosis is not None and diagnosis.engine == "evidence"
         rest = "all other sets together" if has_unlisted else "all other sets of listed effects together"
         rows.append((rest, max(1.0 - sum(p for _, p in rows), 0.0)))
         for effect in diagnosis.effects if diagnosis is not None and not has_unlisted else ():
-            if one.side in effect.sides:
+            if models.side in effect.sides:
                 title = effect_title(effect.name)
                 rows += [(f"rival of {title}: {effect_title(r.name)}", r.probability) for r in effect.rivals]
-        found.append((one.side, rows))
-    return found
+        likeliest_sets.append((models.side, rows))
+    return likeliest_sets
 
 
 def set_in_words(item: EffectSet) -> str:
@@ -164,9 +164,9 @@ def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
         return
     yield from (_sure_of(effect) for effect in diagnosis.effects[:NAMED])
     if diagnosis.engine == "evidence" and diagnosis.verdict == "no_mismatch":
-        for one in diagnosis.models:
-            nothing = sum(item.probability for item in one.sets if not item.effects and not item.unlisted)
-            yield f"No effect and nothing unlisted in the {one.side} camera: probability {nothing:.3f}."
+        for models in diagnosis.models:
+            nothing = sum(item.probability for item in models.sets if not item.effects and not item.unlisted)
+            yield f"No effect and nothing unlisted in the {models.side} camera: probability {nothing:.3f}."
     held = diagnosis.held_out
     if held is not None and held.n and (diagnosis.effects or diagnosis.discovered):
         laws = held.chi2_discovered

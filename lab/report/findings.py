@@ -49,8 +49,8 @@ def _proof(curve: ResidualCurve) -> ProofCurve:
 def findings(fit: FitResult, validation: ValidationResult | None, diagnosis: DiagnosisResult) -> DiagnosisFindings:
     """Return what is told of a diagnosis, and of the fit and the validation that go with it."""
     verdict, _, headline = words.headline(diagnosis)
-    told = [picture for picture in diagnosis.pictures if _taken_away(picture) >= WORTH_A_PICTURE]
-    best = {picture.side: picture for picture in sorted(told, key=_taken_away)}
+    shown = [picture for picture in diagnosis.pictures if _taken_away(picture) >= WORTH_A_PICTURE]
+    best = {picture.side: picture for picture in sorted(shown, key=_taken_away)}
     return DiagnosisFindings(
         verdict=verdict,
         headline=headline,
