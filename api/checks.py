@@ -91,7 +91,7 @@ class DeviceChecks:
             name=f"check {name} {', '.join(devices)}",
             daemon=True,
         )
-        self._threads = [other for other in self._threads if other.is_alive()] + [thread]
+        self._threads = [running for running in self._threads if running.is_alive()] + [thread]
         thread.start()
 
     def _work(

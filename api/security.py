@@ -238,11 +238,11 @@ class SameHost:
             except ValueError:
                 origin_host = ""
             if origin_host != named[0].lower():
-                own = f"http(s)://{named[0]}"
+                expected = f"http(s)://{named[0]}"
                 return problem(
                     403,
-                    f"Origin: {origin[:80]!r} isn't this service's, which is {own!r} here; open the page under that "
-                    "address, or send no Origin",
+                    f"Origin: {origin[:80]!r} isn't this service's, which is {expected!r} here; open the page under "
+                    "that address, or send no Origin",
                 )
         return None
 

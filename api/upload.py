@@ -209,8 +209,8 @@ def _top(folder: Path, holds: str | None = _MANIFEST) -> Path:
     file is beside it."""
     entries = list(folder.iterdir())
     inner = [entry for entry in entries if entry.is_dir()]
-    here = (folder / holds).exists() if holds is not None else len(entries) > 1
-    return inner[0] if not here and len(inner) == 1 else folder
+    is_holder = (folder / holds).exists() if holds is not None else len(entries) > 1
+    return inner[0] if not is_holder and len(inner) == 1 else folder
 
 
 def as_in_archive(text: str, place: Path) -> str:

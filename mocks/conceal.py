@@ -44,7 +44,7 @@ def parse(specs: Iterable[str]) -> Concealed:
     for spec in specs:
         sides, effect = _parse(spec.strip())
         for side in sides:
-            if any(type(other) is type(effect) for other in by_side[side]):
+            if any(type(acting) is type(effect) for acting in by_side[side]):
                 raise ConcealError(f"--conceal {spec}: {effect.name} is concealed on the {side} already; give it once")
             by_side[side] = (*by_side[side], effect)
     return by_side

@@ -54,14 +54,14 @@ def _told(service: Service) -> list[QueueEntry]:
         at,
     )
     entries = []
-    for place, one in enumerate(waiting, start=1):
-        start, end = expected.get(one.id, (None, None))
-        request = kept_request(store, one.id)
+    for place, waiting_session in enumerate(waiting, start=1):
+        start, end = expected.get(waiting_session.id, (None, None))
+        request = kept_request(store, waiting_session.id)
         entries.append(
             QueueEntry(
-                **one.model_dump(exclude={"place", "held"}),
+                **waiting_session.model_dump(exclude={"place", "held"}),
                 place=place,
-                held=service.public.or_none(one.held),
+                held=service.public.or_none(waiting_session.held),
                 expected_start=start,
                 expected_end=end,
                 then=request.then.in_words if request is not None and request.then is not None else None,
@@ -173,9 +173,9 @@ def halt(
             }:  # it has no file any more
                 stations[f"session {id}"] = session.station
     answering = list(ended.values())
-    for one in {key_of(one): one for one in stations.values()}.values():
-        if key_of(one) not in busy:
-            answering.append(live.make_safe(one))
+    for idle_station in {key_of(station): station for station in stations.values()}.values():
+        if key_of(idle_station) not in busy:
+            answering.append(live.make_safe(idle_station))
     wait([held], max(0.0, until_s - time.monotonic()))
     later = live.halt(station, why)  # what the queue began in between
     wait([*answering, *later.values()], max(0.0, until_s - time.monotonic()))
@@ -184,9 +184,13 @@ def halt(
         for name, why_not in unusable.items()
         if (words := service.public(f"its station file can't be used, so it wasn't asked: {why_not}"))
     ]
-    for name, one in stations.items():
-        if (found := live.safety.find(one)) is None or (found.state == "halting" and found.shutter == "unknown"):
-            live.safety.note_trouble(one, f"no answer of its shutter within {ANSWER_S:g} s; it is still being asked")
-        if (safety := service.safety(one)) is not None:
+    for name, asked_station in stations.items():
+        if (state := live.safety.find(asked_station)) is None or (
+            state.state == "halting" and state.shutter == "unknown"
+        ):
+            live.safety.note_trouble(
+                asked_station, f"no answer of its shutter within {ANSWER_S:g} s; it is still being asked"
+            )
+        if (safety := service.safety(asked_station)) is not None:
             answers.append(HaltedStation(name=name, safety=safety))
     return Halted(sessions=tuple(dict.fromkeys([*ended, *later])), stations=tuple(answers))

@@ -134,7 +134,7 @@ def get_recordings(service: Here, recordings_id: HexId) -> RecordingsDetail:
 
 
 def _capture(recordings_id: str, number: int, capture: Capture) -> RecordedCapture:
-    here = f"/api/v1/recordings/{recordings_id}/captures/{number}"
+    address = f"/api/v1/recordings/{recordings_id}/captures/{number}"
     document = capture.model_dump(mode="json", exclude_none=True)
     return RecordedCapture(
         id=number,
@@ -143,8 +143,8 @@ def _capture(recordings_id: str, number: int, capture: Capture) -> RecordedCaptu
         side=capture.side,
         exposure_s=document.get("exposure_s"),
         document=document,
-        preview=f"{here}/preview.png",
-        frame=f"{here}/frame.npy",
+        preview=f"{address}/preview.png",
+        frame=f"{address}/frame.npy",
     )
 
 

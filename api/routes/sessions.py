@@ -326,8 +326,10 @@ async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> A
     last_state = None
     live = service.live.find(session_id)
     if live is None:  # another process runs it, or nobody does
-        async for told in watched(look, lambda session: session.state in OVER, "state", stopping, service.changed):
-            yield told
+        async for progress_event in watched(
+            look, lambda session: session.state in OVER, "state", stopping, service.changed
+        ):
+            yield progress_event
         return
     yield event("state", await asyncio.to_thread(look))
     async for progress in live.follow(stopping):
@@ -359,12 +361,12 @@ def session_events(service: Here, session_id: SessionId) -> EventSourceResponse:
 
 
 def _capture(info: CaptureInfo) -> StoredCapture:
-    here = f"/api/v1/sessions/{info.session_id}/captures/{info.id}"
+    address = f"/api/v1/sessions/{info.session_id}/captures/{info.id}"
     return StoredCapture(
         **info.model_dump(),
         exposure_s=info.document.get("exposure_s"),
-        preview=f"{here}/preview.png",
-        frame=f"{here}/frame.npy",
+        preview=f"{address}/preview.png",
+        frame=f"{address}/frame.npy",
     )
 
 

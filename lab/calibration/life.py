@@ -189,15 +189,15 @@ def check_certified(store: Store, instruments: Snapshots, station: Station) -> N
         if expired and expired[0].expires
         else f"{len(history)} calibrations of it are known, none is certified"
     )
-    for other in [
+    for certified in [
         calibration
         for calibration in others
         if calibration.state == "certified" and calibration.cameras.keys() == cameras.keys()
     ][:1]:
         changed = [
-            f"{side} was {was}, is {cameras[side]}" for side, was in other.cameras.items() if was != cameras[side]
+            f"{side} was {was}, is {cameras[side]}" for side, was in certified.cameras.items() if was != cameras[side]
         ]
-        why += f" (the newest certified one, {other.id}, is of other cameras: {'; '.join(changed)})"
+        why += f" (the newest certified one, {certified.id}, is of other cameras: {'; '.join(changed)})"
     raise InputError(
         f"cameras {', '.join(cameras.values())}: the session demands a certified calibration, and {why}; certify one "
         "with "

@@ -467,8 +467,8 @@ def _record_or_none(generation: Generation) -> GenerationRecord | None:
     return None
 
 
-def _same_size_and_time(file: Path, other: Path) -> bool:
-    a, b = file.lstat(), other.lstat()
+def _same_size_and_time(file: Path, second: Path) -> bool:
+    a, b = file.lstat(), second.lstat()
     return (a.st_size, a.st_mtime_ns) == (b.st_size, b.st_mtime_ns)
 
 

@@ -244,9 +244,9 @@ def _stage(generation: Generation, target: Path, advance: Advance) -> None:
     staging = target / STAGED
     folder = staging / generation.name
     shutil.rmtree(target / _DONE, ignore_errors=True)
-    for other in staging.glob("[!.]*"):
-        if other.name != generation.name:
-            remove_tree(other)
+    for previous in staging.glob("[!.]*"):
+        if previous.name != generation.name:
+            remove_tree(previous)
     folder.mkdir(parents=True, exist_ok=True)
     files = generation.record.files
     missing = [

@@ -149,19 +149,25 @@ def station_text(instruments: Iterable[Found]) -> str:
     taken: set[str] = set()
     there = list(instruments)
     pair = sum(instrument.family == "camera" for instrument in there) > 1
-    for one in there:
-        if one.family == "camera" and (side := next(sides, None)) is not None:
-            sensor = _sensor(side, one)
-            lines += ["", *_camera_table(side, one, sensor, pair)]
+    for instrument in there:
+        if instrument.family == "camera" and (side := next(sides, None)) is not None:
+            sensor = _sensor(side, instrument)
+            lines += ["", *_camera_table(side, instrument, sensor, pair)]
             cameras += 1
             if sensor.exposure_s is not None:
                 exposures.append(sensor.exposure_s)
-        elif one.family and one.family != "camera" and one.family not in taken:
-            taken.add(one.family)
-            lines += ["", f"# {one.what}", f"[{one.family}]", f'driver = "{one.name}"', f'address = "{one.address}"']
-            lines += [f'{key} = ""  # to be filled in' for key in one.needs]
+        elif instrument.family and instrument.family != "camera" and instrument.family not in taken:
+            taken.add(instrument.family)
+            lines += [
+                "",
+                f"# {instrument.what}",
+                f"[{instrument.family}]",
+                f'driver = "{instrument.name}"',
+                f'address = "{instrument.address}"',
+            ]
+            lines += [f'{key} = ""  # to be filled in' for key in instrument.needs]
         else:
-            lines += ["", f"# also connected: {one.what} at {one.address}"]
+            lines += ["", f"# also connected: {instrument.what} at {instrument.address}"]
     if not cameras:
         raise DeviceError(
             "no camera is connected that a driver here reaches: plug it in, give --usbip HOST:PORT, or install its "

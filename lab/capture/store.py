@@ -365,8 +365,8 @@ class Store:
             station = row.station.get("name", "")
             asked = sa.select(SessionRow.id, SessionRow.station, SessionRow.runs)
             asked = asked.where(sa.tuple_(SessionRow.created, SessionRow.id) <= sa.tuple_(row.created, row.id))
-            for id, other, runs in db.execute(asked.order_by(SessionRow.created.desc(), SessionRow.id.desc())):
-                if runs and other.get("name", "") == station:
+            for id, station_keys, runs in db.execute(asked.order_by(SessionRow.created.desc(), SessionRow.id.desc())):
+                if runs and station_keys.get("name", "") == station:
                     return id, RunRecord.model_validate(runs[-1])
         return None
 

@@ -160,19 +160,19 @@ def repeats_ahead(steps: Sequence[Step | None]) -> list[int]:
     """Return how many of the steps that follow each at once only repeat its exposure; None: a step that isn't taken."""
     counts = [0] * len(steps)
     for at in range(len(steps) - 2, -1, -1):
-        step, other = steps[at], steps[at + 1]
-        if step is not None and other is not None and _repeats(step, other):
+        step, following = steps[at], steps[at + 1]
+        if step is not None and following is not None and _repeats(step, following):
             counts[at] = counts[at + 1] + 1
     return counts
 
 
-def _repeats(step: Step, other: Step) -> bool:
+def _repeats(step: Step, following: Step) -> bool:
     """Return whether the second step does nothing but expose as the first did."""
     return (
-        bool(step.captures and other.captures)
-        and other.radiance is None
-        and other.setting == step.setting
-        and other.exposure == step.exposure
+        bool(step.captures and following.captures)
+        and following.radiance is None
+        and following.setting == step.setting
+        and following.exposure == step.exposure
     )
 
 

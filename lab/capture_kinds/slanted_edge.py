@@ -183,7 +183,7 @@ def edge_steps(
             for side in station.sides:
                 layout = edge.left if side == "left" else edge.right
                 for region in _regions(layout, sequence.turn_deg, station, side):
-                    own = {
+                    geometry = {
                         "id": "-".join(filter(None, (prefix, name, str(frame), region.name, side))),
                         "kind": get_args(kind.model_fields["kind"].annotation)[0],
                         "region": region.region,
@@ -192,7 +192,7 @@ def edge_steps(
                         "field_mm": region.field_mm,
                         "colour_temperature_k": sequence.colour_temperature_k,
                     }
-                    captures.append(kind.model_validate(planned_keys(id, side) | own | keys))
+                    captures.append(kind.model_validate(planned_keys(id, side) | geometry | keys))
             made.append(
                 Step(
                     id=id,
