@@ -80,7 +80,7 @@ def answers(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {status: {"description": _MEANINGS[status], "content": content} for status in statuses}
 
 
-def known(what: str, look: Callable[[], T]) -> T:
+def find_or_404(what: str, look: Callable[[], T]) -> T:
     """Return the result of `look`. Raises 404 with `what` as its one line where `look` raises InputError."""
     try:
         return look()

@@ -90,7 +90,7 @@ class Gate:
         holder_of_key = holder(key, self.keys(False)) or holder(key, self.keys(True))
         if holder_of_key is None:
             self._proven.discard(mine)
-            self.failures.failed(address)
+            self.failures.count_failure(address)
         else:
             self._proven.add(mine)
         return holder_of_key

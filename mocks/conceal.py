@@ -67,10 +67,10 @@ def _parse(spec: str) -> tuple[tuple[Side, ...], Effect]:
     kind = library()[name]
     if "light" in kind.stages() and sides != SIDES:
         raise ConcealError(f"--conceal {spec}: {name} is of the rig before both cameras; write both:{name}:{text}")
-    return sides, _made(spec, kind, text)
+    return sides, _make_effect(spec, kind, text)
 
 
-def _made(spec: str, kind: type[Effect], text: str) -> Effect:
+def _make_effect(spec: str, kind: type[Effect], text: str) -> Effect:
     quantities = kind.quantities()
     names = (*quantities, *(name for name, field in kind.choices().items() if _is_one_value(field.annotation)))
     known = ", ".join(names)

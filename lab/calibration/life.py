@@ -27,7 +27,7 @@ from lab.calibration.limits import (
     Limit,
     Mark,
     figures_of,
-    judged,
+    judge_figures,
 )
 from lab.capture.records import RunRecord, now
 from lab.capture.station import Station
@@ -410,11 +410,11 @@ def certify(
         raise InputError(
             f"calibration {wanted.id}: is {wanted.state}, only a candidate can be certified; fit the session again"
         )
-    judgements = judged(figures(store, wanted.id), limits)
+    judgements = judge_figures(figures(store, wanted.id), limits)
     refused = ("bad", "missing") if accept_warnings else ("warn", "bad", "missing")
     if lines := [_refusal(wanted.id, judgement) for judgement in judgements if judgement.mark in refused]:
         raise InputError("\n".join(lines))
-    drafts, whence = drafted_limits(store, wanted.id)
+    drafts, whence = draft_limits(store, wanted.id)
     bands = {(draft.figure, draft.side, draft.place, draft.good) for draft in drafts}
     is_drafted = any((limit.figure, limit.side, limit.place, limit.good) in bands for limit in limits.limit)
     limits = limits.model_copy(update={"drafted_from": whence if is_drafted else ()})
@@ -732,7 +732,7 @@ DRAFTED_FROM, DRAFTED_LEAST = 30, 3
 DRAFTED_COVERAGE = 1.0 - FALSE_ALARM_RATE
 
 
-def drafted_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], tuple[str, ...]]:
+def draft_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], tuple[str, ...]]:
     """Limits drafted from what the cameras of a calibration had before it, and the ids of the calibrations that they
     were drafted from, the newest last.
 

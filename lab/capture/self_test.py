@@ -52,8 +52,10 @@ def self_test(station: Station, name: str, connect: Callable[[Station], Drivers]
     """Return the self-test of one instrument (`monochromator`, `cameras.left`, ...). Raises InputError if the station
     hasn't got it."""
     _entry(station, name)
-    side = _said(name).partition(" ")[2]
-    return _self_test(_said(name), connect(station).all[_said(name)], data_sheets(station).get(side))
+    side = _format_device_name(name).partition(" ")[2]
+    return _self_test(
+        _format_device_name(name), connect(station).all[_format_device_name(name)], data_sheets(station).get(side)
+    )
 
 
 def data_sheets(station: Station) -> dict[str, DataSheet]:
@@ -61,7 +63,7 @@ def data_sheets(station: Station) -> dict[str, DataSheet]:
     return {side: camera.datasheet for side, camera in station.cameras.items()}
 
 
-def _said(name: str) -> str:
+def _format_device_name(name: str) -> str:
     """Return a device's name in messages: `camera left` for `cameras.left`."""
     family, _, side = name.partition(".")
     return f"camera {side}" if side else family
@@ -118,7 +120,7 @@ def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
     except OSError as error:
         raise cannot_write(file, error, "name another file") from error
     try:
-        answer = _said(name)
+        answer = _format_device_name(name)
         try:
             made = driver(answer.partition(" ")[0], entry.driver)(entry.address, recorder=recorder, **entry.settings)
         except (InstrumentError, TypeError) as error:

@@ -228,7 +228,7 @@ def take(
         yield from _shoot(instruments, shot)
         retaken += cameras.retaken
         files += cameras.stored.values()
-        captures = _completed(step, instruments, dummies)
+        captures = _complete_keys(step, instruments, dummies)
         result |= {"level": dict(cameras.levels)}
         if retaken:
             result["retaken"] = retaken
@@ -285,7 +285,7 @@ def _exposures(step: Step, instruments: Instruments, results: Mapping[str, Mappi
     }
 
 
-def _completed(step: Step, instruments: Instruments, dummies: int) -> tuple[Capture, ...]:
+def _complete_keys(step: Step, instruments: Instruments, dummies: int) -> tuple[Capture, ...]:
     """Return the step's captures with the keys that the trigger, the `dummies` before it, and the instruments tell."""
     without = instruments.photodiode if instruments.photodiode and instruments.photodiode.measured is None else None
     readings = {

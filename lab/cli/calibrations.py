@@ -80,14 +80,14 @@ def show(id: Id, limits: LimitsFile = None, json: Json = None, data: StoreFolder
     Example: calibench calibrations show 20261127-101500-7f3ad2
     """
     from lab.calibration.life import calibration, figures
-    from lab.calibration.limits import judged
+    from lab.calibration.limits import judge_figures
     from lab.formats.results.words import format_unit
 
     check_writable(json)
     store = store_to_read(data)
     record = calibration(store, id)
     chosen = record.limits if limits is None and record.limits is not None else _standing(store, limits)
-    by_limit = judged(figures(store, record.id), chosen) if chosen is not None else ()
+    by_limit = judge_figures(figures(store, record.id), chosen) if chosen is not None else ()
     write_json(record.model_copy(update={"limits": chosen, "judgements": by_limit}), json)
     if str(json) != "-":
         who = f" by {record.certified_by} at {record.certified:%Y-%m-%d %H:%M}" if record.certified else ""

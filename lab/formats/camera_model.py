@@ -188,7 +188,7 @@ def _curves(
         stated = (camera.quantum_efficiency or {}).get(channel)
         if fitted is not None and channel in fitted.quantum_efficiency and not (maker_curves and stated):
             curve = Spectrum.of(fitted.wavelength_nm, np.maximum(fitted.quantum_efficiency[channel], 0.0))
-            curves[channel] = _continued(curve, recordings.spectrum(stated)) if stated else curve
+            curves[channel] = _continue_curve(curve, recordings.spectrum(stated)) if stated else curve
             if channel in fitted.quantum_efficiency_std:
                 spread[channel] = Spectrum.of(fitted.wavelength_nm, fitted.quantum_efficiency_std[channel])
         elif stated:
@@ -221,7 +221,7 @@ def _peak_level(wavelength_nm: float, efficiency: float) -> float:
     return efficiency / float(np.exp(-0.5 * ((wavelength_nm - peak) / width) ** 2))
 
 
-def _continued(fitted: Spectrum, stated: Spectrum) -> Spectrum:
+def _continue_curve(fitted: Spectrum, stated: Spectrum) -> Spectrum:
     """Return a fitted sensitivity, continued beyond the sweep's wavelengths by the maker's curve, scaled to join at
     both ends.
 

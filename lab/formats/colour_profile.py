@@ -44,7 +44,7 @@ def energy_sensitivities(camera: CameraModel) -> FloatArray:
     return np.asarray(curves / curves.max())
 
 
-def left_out(content: CameraFile) -> tuple[str, ...]:
+def list_losses(content: CameraFile) -> tuple[str, ...]:
     """Return a remark on the effects of a camera file, which its curves don't have."""
     names = ", ".join(effect.name for effect in content.effects)
     return (f"the curves are those of quantum_efficiency: effects aren't in them ({names})",) if names else ()
@@ -73,7 +73,7 @@ def write_rawtoaces(file: Path, content: CameraFile) -> tuple[str, ...]:
     }
     with replacing(file) as partial:
         partial.write_text(json.dumps(document, indent=4) + "\n", encoding="utf-8")
-    return left_out(content)
+    return list_losses(content)
 
 
 def colour_matrices(camera: CameraModel, light: str) -> tuple[FloatArray, FloatArray]:
@@ -133,7 +133,7 @@ def write_dcp(file: Path, content: CameraFile) -> tuple[str, ...]:
     ]
     with replacing(file) as partial:
         partial.write_bytes(_tiff(entries))
-    return left_out(content)
+    return list_losses(content)
 
 
 def _ascii(tag: int, text: str) -> tuple[int, int, int, bytes]:
@@ -190,7 +190,7 @@ def write_icc(file: Path, content: CameraFile) -> tuple[str, ...]:
     )  # fmt: skip
     with replacing(file) as partial:
         partial.write_bytes(head + table + data)
-    return left_out(content)
+    return list_losses(content)
 
 
 def _xyz(value: FloatArray) -> bytes:

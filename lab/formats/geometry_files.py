@@ -54,7 +54,7 @@ class Pair:
         return np.asarray(self.stereo.translation_mm, float)
 
 
-def paired(left: CameraFile, right: CameraFile, stereo: StereoFit) -> tuple[CameraFile, Pair]:
+def pair_cameras(left: CameraFile, right: CameraFile, stereo: StereoFit) -> tuple[CameraFile, Pair]:
     """Return two cameras with the intrinsics that were fitted jointly with their pose, where the fit states them."""
     cameras = []
     for content, matrix, distortion, kind, angle_deg in (
@@ -124,7 +124,7 @@ def _intrinsics(content: CameraFile, pinhole_counts: Sequence[int]) -> _Intrinsi
     projection = Projection.of(geometry)
     intrinsics = projection.intrinsics(geometry.camera_matrix, geometry.distortion)
     place = (float(intrinsics[0]), float(intrinsics[1]), float(intrinsics[2]), float(intrinsics[3]))
-    remarks = _left_out(content)
+    remarks = _list_losses(content)
     if camera.geometry is None:
         remarks = (
             "geometry: not set; a pinhole of lens.focal_length_mm with its centre in the frame's middle is written",
@@ -137,12 +137,12 @@ def _intrinsics(content: CameraFile, pinhole_counts: Sequence[int]) -> _Intrinsi
         if enough:
             return _Intrinsics("pinhole", place, (*given, *(0.0,) * 8)[: enough[0]], remarks)
         names = projection.coefficients[pinhole_counts[-1] : used]
-        fitted, left_px = _fitted(camera, geometry, Projection("pinhole"), pinhole_counts[-1])
+        fitted, left_px = _fit_coefficients(camera, geometry, Projection("pinhole"), pinhole_counts[-1])
         lost = ", ".join(names)
     elif projection.kind == "equidistant":
         return _Intrinsics("equidistant", place, (*given, *(0.0,) * 4)[:4], remarks)
     else:
-        fitted, left_px = _fitted(camera, geometry, Projection("equidistant"), 4)
+        fitted, left_px = _fit_coefficients(camera, geometry, Projection("equidistant"), 4)
         lost = "the splined stereographic projection"
     remarks = (*_departure(lost, left_px), *remarks)
     kind: ProjectionKind = "pinhole" if projection.kind == "pinhole" else "equidistant"
@@ -168,7 +168,9 @@ def _frame(camera: CameraModel, geometry: Geometry) -> tuple[FloatArray, FloatAr
     return image[seen], rays[seen]
 
 
-def _fitted(camera: CameraModel, geometry: Geometry, to: Projection, count: int) -> tuple[tuple[float, ...], float]:
+def _fit_coefficients(
+    camera: CameraModel, geometry: Geometry, to: Projection, count: int
+) -> tuple[tuple[float, ...], float]:
     """Return the first `count` coefficients of a law, fitted to a geometry over the frame by least squares in px, and
     the greatest distance that is left (px). The law is linear in them, up to the denominator's, which aren't fitted."""
     image, rays = _frame(camera, geometry)
@@ -187,7 +189,7 @@ def _fitted(camera: CameraModel, geometry: Geometry, to: Projection, count: int)
     return tuple(float(value) for value in solved / scale), float(np.hypot(*left.T).max())
 
 
-def _left_out(content: CameraFile) -> tuple[str, ...]:
+def _list_losses(content: CameraFile) -> tuple[str, ...]:
     """Return a line on the effects of a camera file, with the size of what bends the image further."""
     named = []
     for effect in content.effects:
@@ -204,7 +206,7 @@ def _sides(content: CameraFile, pair: Pair | None) -> dict[str, CameraFile]:
     return {"": content} if pair is None else {"left": content, "right": pair.right}
 
 
-def _told(side: str, remarks: tuple[str, ...]) -> tuple[str, ...]:
+def _name_side(side: str, remarks: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"{side}: {remark}" if side else remark for remark in remarks)
 
 
@@ -244,7 +246,7 @@ def write_opencv(file: Path, content: CameraFile, pair: Pair | None = None) -> t
         store.write(
             f"D{number}" if side else "distortion_coefficients", np.array(intrinsics.coefficients).reshape(-1, 1)
         )
-        remarks += _told(side, intrinsics.remarks)
+        remarks += _name_side(side, intrinsics.remarks)
     if pair is not None:
         store.write("R", pair.rotation)
         store.write("T", pair.translation_mm.reshape(3, 1))
@@ -291,7 +293,7 @@ def write_ros(file: Path, content: CameraFile, pair: Pair | None = None) -> tupl
             "projection_matrix": _matrix(projection),
         }
         _write(_beside(file, side), _yaml(document))
-        remarks += _told(side, intrinsics.remarks)
+        remarks += _name_side(side, intrinsics.remarks)
     if pair is not None and at is None:
         remarks += (f"pose: left out, the fit has no rectification (baseline {pair.stereo.baseline_mm:g} mm)",)
     return remarks
@@ -324,7 +326,7 @@ def write_kalibr(file: Path, content: CameraFile, pair: Pair | None = None) -> t
             "resolution": [side_content.camera.cols, side_content.camera.rows],
             "rostopic": f"/cam{number}/image_raw",
         }
-        remarks += _told(side, intrinsics.remarks)
+        remarks += _name_side(side, intrinsics.remarks)
     _write(file, _yaml(document))
     return remarks
 
@@ -344,7 +346,7 @@ def write_colmap(file: Path, content: CameraFile, pair: Pair | None = None) -> t
         fx, fy, cx, cy = intrinsics.focal_centre_px
         numbers = " ".join(repr(value) for value in (fx, fy, cx + 0.5, cy + 0.5, *intrinsics.coefficients))
         lines.append(f"{number} {model} {side_content.camera.cols} {side_content.camera.rows} {numbers}")
-        remarks += _told(side, intrinsics.remarks)
+        remarks += _name_side(side, intrinsics.remarks)
     _write(file, "\n".join(lines) + "\n")
     if pair is not None:
         remarks += (f"pose: left out, cameras.txt has none (baseline {pair.stereo.baseline_mm:g} mm)",)
@@ -367,7 +369,7 @@ def write_mrcal(file: Path, content: CameraFile, pair: Pair | None = None) -> tu
             pose[:3] = cv2.Rodrigues(pair.rotation)[0].ravel()
             pose[3:] = pair.translation_mm * METRE_PER_MM
         if side_content.camera.geometry is not None and side_content.camera.geometry.projection != "pinhole":
-            model, numbers, losses = _splined(side_content, side_content.camera.geometry)
+            model, numbers, losses = _convert_to_splines(side_content, side_content.camera.geometry)
         else:
             intrinsics = _intrinsics(side_content, (0, 4, 5, 8))
             model, losses = _MRCAL_MODELS[len(intrinsics.coefficients)], intrinsics.remarks
@@ -377,14 +379,14 @@ def write_mrcal(file: Path, content: CameraFile, pair: Pair | None = None) -> tu
             "{\n"
             f"    'lensmodel':  '{model}',\n\n"
             f"    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....\n"
-            f"    'intrinsics': {_listed(numbers)},\n\n"
+            f"    'intrinsics': {_format_list(numbers)},\n\n"
             f"    # the transformation from the reference to the camera: Rodrigues' vector, and m\n"
-            f"    'extrinsics': {_listed(pose)},\n\n"
+            f"    'extrinsics': {_format_list(pose)},\n\n"
             f"    'imagersize': [ {side_content.camera.cols}, {side_content.camera.rows}, ]\n"
             "}\n"
         )
         _write(_beside(file, side), text)
-        remarks += _told(side, losses)
+        remarks += _name_side(side, losses)
     return remarks
 
 
@@ -393,7 +395,7 @@ def write_mrcal(file: Path, content: CameraFile, pair: Pair | None = None) -> tu
 _ACROSS, _SAMPLES, _MARGIN = 40, 6, 2
 
 
-def _splined(content: CameraFile, geometry: Geometry) -> tuple[str, tuple[float, ...], tuple[str, ...]]:
+def _convert_to_splines(content: CameraFile, geometry: Geometry) -> tuple[str, tuple[float, ...], tuple[str, ...]]:
     """Return mrcal's LENSMODEL_SPLINED_STEREOGRAPHIC of a fisheye: its name, its intrinsics, and what is left.
 
     u = 2 tan(theta / 2) in the direction of the ray; q = f (u + d(u)) + c, with d two surfaces of cubic B-splines over
@@ -431,8 +433,8 @@ def _splined(content: CameraFile, geometry: Geometry) -> tuple[str, tuple[float,
     left_px = float(np.hypot(*((u + bent) * focal + centre - image).T).max())
     model = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={counts[0]}_Ny={counts[1]}_fov_x_deg={degrees}"
     numbers = (*intrinsics[:4].tolist(), *control.ravel().tolist())
-    return model, numbers, (*_departure(f"the {fitted.kind} projection", left_px), *_left_out(content))
+    return model, numbers, (*_departure(f"the {fitted.kind} projection", left_px), *_list_losses(content))
 
 
-def _listed(values: Sequence[float] | FloatArray) -> str:
+def _format_list(values: Sequence[float] | FloatArray) -> str:
     return f"[ {' '.join(f'{float(value)!r},' for value in values)} ]"

@@ -429,7 +429,7 @@ class _Calibrations:
                 "has no cropfactor, the unit of its radii; add that of the camera it was calibrated on to <lens>, as "
                 "in <cropfactor>1.5</cropfactor>"
             )
-        return _stated(stated, "cropfactor")
+        return _parse_number(stated, "cropfactor")
 
     def _aspect(self, calibration: ET.Element) -> float:
         """Return the longer side of the calibration's frame over the shorter one."""
@@ -438,7 +438,7 @@ class _Calibrations:
             self.remarks.append("aspect-ratio isn't stated: 3:2 is taken, lensfun's default")
             return DEFAULT_ASPECT
         wide, _, narrow = stated.partition(":")
-        aspect = _stated(wide, "aspect-ratio") / _stated(narrow or "1", "aspect-ratio")
+        aspect = _parse_number(wide, "aspect-ratio") / _parse_number(narrow or "1", "aspect-ratio")
         return max(aspect, 1.0 / aspect)
 
     def _entry(self, line: ET.Element, kind: str, model: str) -> _Entry:
@@ -547,10 +547,10 @@ def _value(element: ET.Element, key: str, otherwise: float | None = None) -> flo
             raise InputError(f"<{element.tag}> has no {key}; add it")
         return otherwise
     above_0 = key in ("focal", "real-focal", "aperture", "distance", "min", "max")
-    return _stated(text, f"{key} of <{element.tag}>", above_0=above_0)
+    return _parse_number(text, f"{key} of <{element.tag}>", above_0=above_0)
 
 
-def _stated(text: str, what: str, above_0: bool = True) -> float:
+def _parse_number(text: str, what: str, above_0: bool = True) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -597,7 +597,7 @@ def with_lens(content: CameraFile, lens: LensfunLens) -> tuple[CameraFile, tuple
     taken: list[type[Effect]] = []
     added: list[Effect] = []
     if lens.centre is not None:
-        camera = _centred(camera, lens.centre)
+        camera = _centre_camera(camera, lens.centre)
     if lens.distortion is not None:
         geometry, left_px = _brown(camera, lens)
         camera = camera.model_copy(update={"geometry": geometry})
@@ -627,7 +627,7 @@ def with_lens(content: CameraFile, lens: LensfunLens) -> tuple[CameraFile, tuple
     return replace(content, camera=camera, effects=(*kept, *added)), tuple(remarks)
 
 
-def _centred(camera: CameraModel, centre: tuple[float, float]) -> CameraModel:
+def _centre_camera(camera: CameraModel, centre: tuple[float, float]) -> CameraModel:
     """Return the camera with the optical axis at this place, from the frame's middle in half of its shorter side."""
     geometry, half_px = geometry_of(camera), _half_short_px(camera)
     (fx, skew, _), (shear, fy, _), last = geometry.camera_matrix

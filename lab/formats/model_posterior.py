@@ -105,7 +105,7 @@ class ModelPosterior(Frozen):
             first=first, names=names, mean=tuple(float(f"{m:.9g}") for m in mean), covariance=tuple(map(tuple, rows))
         )
 
-    def taken(self, names: list[str]) -> tuple[FloatArray, FloatArray]:
+    def select(self, names: list[str]) -> tuple[FloatArray, FloatArray]:
         """Mean (n,) and covariance (n, n) of the parameters `names`. One that isn't known here has its prior: mean 0,
         variance 1."""
         known = {name: i for i, name in enumerate(self.names)}

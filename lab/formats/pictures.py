@@ -62,7 +62,7 @@ def picture_facts(file: Path) -> PictureFacts:
     """Return what a picture's file states, without decoding it. Raises InputError, without the path, where its header
     is damaged or its pages aren't frames of one kind."""
     if file.suffix.lower() in TIFFS:
-        with _opened(file) as tif:
+        with _open(file) as tif:
             return _tiff_facts(tif)
     with file.open("rb") as stream:
         data = stream.read(HEAD_BYTES)
@@ -80,7 +80,7 @@ def read_picture(file: Path, page: int | None = None) -> NDArray[Any]:
     `page`: which page of a TIFF; None: its only one. Raises InputError, without the path, where the picture is damaged,
     has several pages and none is chosen, or its codes don't rise with the light."""
     if file.suffix.lower() in TIFFS:
-        with _opened(file) as tif:
+        with _open(file) as tif:
             pages = _frames(tif)
             if page is None and len(pages) > 1:
                 raise InputError(f"has {len(pages)} pages, not 1; give one picture a file")
@@ -100,7 +100,7 @@ class _Contiguous:
         self.first, self.number = first, number
 
 
-def _opened(file: Path) -> Any:
+def _open(file: Path) -> Any:
     try:
         return tifffile.TiffFile(file)
     except Exception as error:

@@ -11,7 +11,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from lab.calibration.limits import CalibrationLimits, figures_of, judged
+from lab.calibration.limits import CalibrationLimits, figures_of, judge_figures
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.effect_titles import at_beginning, effect_title
@@ -268,9 +268,9 @@ def render_report(
             ]
             for side in sides
         },
-        "compared": words.compared(both.baseline if both else (), tuple(by_improved.values()), fitted_checks),
+        "compared": words.compare_checks(both.baseline if both else (), tuple(by_improved.values()), fitted_checks),
         "models": words.models(both is not None, bool(by_improved)),
-        "judgements": judged(figures_of(fit), limits) if limits is not None else (),
+        "judgements": judge_figures(figures_of(fit), limits) if limits is not None else (),
         "stereo": list(stereo_figures(fit.stereo)) if fit.stereo else [],
         "pairs": fit.stereo.pairs if fit.stereo else 0,
         "pair": geometry.stereo_context(recordings, fit.stereo),

@@ -112,7 +112,7 @@ def effect_line(effect: NamedEffect) -> str:
     return f"{who}: {'; '.join(sizes)}." if sizes else f"{who}."
 
 
-def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
+def list_findings(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
     """Sentences: implausible figures, the named effects, mismatches without a name, and cameras without a mismatch."""
     yield from (f"Warning: {line}." for line in fit.warnings)
     if diagnosis is None:
@@ -246,7 +246,7 @@ def to_do(
         yield f"{left_out} step{'s were' if left_out > 1 else ' was'} left out, each with its remedy, under Left out."
 
 
-def _missed(values: Sequence[float], curve: ResidualCurve) -> float:
+def _rms_residual(values: Sequence[float], curve: ResidualCurve) -> float:
     std = np.maximum(np.asarray(curve.measured_std), 1e-12)
     return float(np.sqrt(np.mean(np.square((np.asarray(curve.measured) - np.asarray(values)) / std))))
 
@@ -269,7 +269,7 @@ def proof_curves(diagnosis: DiagnosisResult) -> list[ResidualCurve]:
 
 def proof_words(curve: ResidualCurve) -> tuple[str, str]:
     """Title and caption of such a measurement."""
-    before, after = _missed(curve.before, curve), _missed(curve.after, curve)
+    before, after = _rms_residual(curve.before, curve), _rms_residual(curve.after, curve)
     title = measurement_title(curve.measurement)
     caption = (
         f"{curve.label}{', held out' if curve.held_out else ''}: rms residual {_short(before)} σ without the effects, "
@@ -346,7 +346,7 @@ def answers(
     """Return the four questions, each with its answers in sentences. `left_out`: number of skipped steps; `warnings`:
     number of warnings about the recordings."""
     return [
-        ("What was found", list(found(fit, diagnosis))),
+        ("What was found", list(list_findings(fit, diagnosis))),
         ("How sure", list(certainty(diagnosis))),
         ("What it means", list(meaning(diagnosis, validation, both))),
         ("What to do", list(to_do(diagnosis, left_out, warnings, fit.warnings))),

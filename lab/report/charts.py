@@ -848,7 +848,7 @@ class ChartData:
         self._lines.append(figure_json(figure))
         return len(self._lines) - 1
 
-    def packed(self) -> str:
+    def pack(self) -> str:
         """All figures, a line of JSON each, compressed, as base64: no text of theirs can end the element that holds
         it."""
         return base64.b64encode(gzip.compress("\n".join(self._lines).encode(), mtime=0)).decode("ascii")
@@ -873,15 +873,15 @@ def _pack(values: Any) -> dict[str, str] | None:
 def figure_json(figure: Figure) -> str:
     """Return a figure as one line of JSON: a trace's numbers as typed arrays, others rounded to 7 digits."""
 
-    def rounded(value: Any, key: str = "") -> Any:
+    def round_numbers(value: Any, key: str = "") -> Any:
         if key in PACKED and (packed := _pack(value)) is not None:
             return packed
         if isinstance(value, dict):
-            return {name: rounded(item, name) for name, item in value.items()}
+            return {name: round_numbers(item, name) for name, item in value.items()}
         if isinstance(value, list | tuple):
-            return [rounded(item) for item in value]
+            return [round_numbers(item) for item in value]
         if isinstance(value, float):
             return float(f"{value:.7g}") if np.isfinite(value) else None
         return value
 
-    return json.dumps(rounded(figure), separators=(",", ":"), allow_nan=False)
+    return json.dumps(round_numbers(figure), separators=(",", ":"), allow_nan=False)

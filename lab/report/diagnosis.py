@@ -164,14 +164,14 @@ def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) ->
     """Return the curve of every measurement that the baseline fits worst, of held-out captures where there are any;
     worst first."""
 
-    def missed(curve: ResidualCurve) -> float:
+    def mean_chi2(curve: ResidualCurve) -> float:
         std = np.maximum(np.asarray(curve.measured_std), 1e-12)
         return float(np.mean(np.square((np.asarray(curve.measured) - np.asarray(curve.before)) / std)))
 
     chosen: dict[str, ResidualCurve] = {}
-    for curve in sorted(curves, key=lambda curve: (curve.held_out, missed(curve))):
+    for curve in sorted(curves, key=lambda curve: (curve.held_out, mean_chi2(curve))):
         chosen[curve.measurement] = curve
-    return sorted(chosen.values(), key=missed, reverse=True)[:most]
+    return sorted(chosen.values(), key=mean_chi2, reverse=True)[:most]
 
 
 def place_maps(diagnosis: DiagnosisResult, sides: Sequence[Side]) -> list[tuple[str, Figure]]:

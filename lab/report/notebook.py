@@ -94,7 +94,7 @@ def _charts(result: object) -> Callable[[], str]:
     return lambda: "".join(picture(chart) for chart in islice(charts_of(result), CHARTS))
 
 
-def _skipped(items: Sequence[Skipped]) -> tuple[str, ...]:
+def _list_skipped(items: Sequence[Skipped]) -> tuple[str, ...]:
     return tuple(f"{item.step}{f' ({item.side})' if item.side else ''}: {item.reason}" for item in items)
 
 
@@ -118,7 +118,7 @@ def _(result: FitResult) -> ShownSummary:
         ("quantity", *(f"{side} (± one standard deviation)" for side in sides)),
         tuple(rows),
         tuple(f"Warning: {line}" for line in result.warnings),
-        _skipped(result.skipped),
+        _list_skipped(result.skipped),
         _charts(result),
     )
 
@@ -144,7 +144,7 @@ def _(result: ValidationResult) -> ShownSummary:
         ("side", "check", "capture", "chi2", "n", "rms difference", "result"),
         rows,
         (),
-        _skipped(result.skipped),
+        _list_skipped(result.skipped),
         _charts(result),
     )
 
@@ -172,7 +172,7 @@ def _(result: DiagnosisResult) -> ShownSummary:
         ("effect", "probability", "alternatives"),
         rows,
         tuple(lines),
-        _skipped(result.skipped),
+        _list_skipped(result.skipped),
         _charts(result),
     )
 
@@ -202,7 +202,7 @@ def _(result: ComparisonResult) -> ShownSummary:
         ("side", "quantity", "A", "B", "difference, sigma", ""),
         rows,
         result.instruments,
-        _skipped(result.skipped),
+        _list_skipped(result.skipped),
     )
 
 
@@ -279,7 +279,9 @@ def _(result: SealedPrediction) -> ShownSummary:
     counted = Counter(
         (side, number.quantity) for side, side_prediction in result.sides.items() for number in side_prediction.numbers
     )
-    skipped = tuple(line for side_prediction in result.sides.values() for line in _skipped(side_prediction.skipped))
+    skipped = tuple(
+        line for side_prediction in result.sides.values() for line in _list_skipped(side_prediction.skipped)
+    )
     rows = tuple((side, title(quantity), str(number)) for (side, quantity), number in counted.items())
     return ShownSummary(f"Prediction of {result.plan}", ("side", "quantity", "numbers"), rows, skipped=skipped)
 
@@ -301,7 +303,7 @@ def _(result: TwinScore) -> ShownSummary:
             for quantity in result.quantities
         ),
         tuple(f"{side}: {conclusion([e for e in result.effects if e.side == side])}" for side in sides),
-        _skipped(result.skipped),
+        _list_skipped(result.skipped),
     )
 
 

@@ -350,7 +350,7 @@ def _distribution(
         for name, by in zip(light.parameters, light.by.T, strict=True):
             columns[name] = columns.get(name, 0.0) + rates @ by
     jacobian = np.column_stack([*columns.values(), np.zeros((len(covariance), 0))])
-    mean, known = posterior.taken(list(columns))
+    mean, known = posterior.select(list(columns))
     covariance += jacobian @ known @ jacobian.T
     shift += sum((mean[k] * mean_columns[name] for k, name in enumerate(columns) if name in mean_columns), shift * 0.0)
     if growth_std:

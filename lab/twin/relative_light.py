@@ -88,7 +88,7 @@ def relative_light(dataset: Dataset, effects: Effects, posterior: ModelPosterior
         for c, column in zip(coords, by_effect, strict=True)
         if (name := coordinate_name(acting, c)) in posterior.names
     }
-    mean, _ = posterior.taken(list(known))
+    mean, _ = posterior.select(list(known))
     jacobian = np.column_stack([*known.values(), np.zeros((len(block.value), 0))])
     noise = block.covariance + sum((np.outer(c, c) for c in columns.values()), np.zeros_like(block.covariance))
     of_rates = np.column_stack(list(rates.values()))

@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from lab.capture_kinds.base import Capture
 from lab.errors import InputError
-from lab.formats.camera_file import lens_cache, traced_table
+from lab.formats.camera_file import lens_cache, trace_table
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
 from lab.observables.dataset import Dataset
@@ -229,7 +229,7 @@ def _camera(sealed: SealedPrediction, side: Side) -> CameraModel:
         table = load_cached(lens_cache(), wanted)
         file = sealed.changes.lens
         if table is None and file is not None and file.is_file():
-            table = traced_table(file)
+            table = trace_table(file)
         if table is None or table.content_hash != wanted:
             where = f"lens: {file}" if file is not None else f"the {side} camera's lens"
             raise InputError(

@@ -22,7 +22,7 @@ import numpy as np
 
 from lab.errors import InputError
 from lab.formats.cgats import read_foreign_text
-from lab.formats.importers.images import ImageFiles, described_sides, read_camera_file, read_image
+from lab.formats.importers.images import ImageFiles, read_camera_file, read_image, read_sides
 from lab.formats.importers.own_statements import compare_with_files
 from lab.formats.importers.stated_settings import check_against_frames
 from lab.formats.pictures import IMAGES, TIFFS, picture_facts
@@ -217,7 +217,7 @@ def read_emva1288(path: Path) -> RecordingSet:
     manifest, warnings = without_common_photons(manifest, str(file), warnings)
     manifest, said = check_against_frames(manifest, frames, str(file))
     warnings += said
-    stated = {**described_sides(file.parent / "camera.toml")["left"]}
+    stated = {**read_sides(file.parent / "camera.toml")["left"]}
     if descriptor.bits is not None:
         stated["bit_depth"] = descriptor.bits
     warnings += compare_with_files(camera, stated, frames.values())

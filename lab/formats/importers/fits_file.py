@@ -102,7 +102,7 @@ def unpacked_name(name: str) -> str:
 def load_fits(file: Path, plane: int | None = None) -> Frame:
     """Return the only frame of a FITS file, or that `plane` of a cube, uint16 (rows, cols) with BZERO and BSCALE
     applied. InputError without the path."""
-    values, _ = _opened(file)
+    values, _ = _read_image(file)
     planes = _planes(values.shape)
     if planes > 1 and plane is None:
         raise InputError(f"holds {planes} frames, not 1; give a folder of frames, or save one file a frame")
@@ -119,7 +119,7 @@ def load_fits(file: Path, plane: int | None = None) -> Frame:
 def fits_header(file: Path, *, with_image: bool = True, ignored: Collection[str] = ()) -> FitsHeader:
     """Return what the header says; InputError without the path. Without `with_image`, the image isn't read, and damage
     in it stays unseen. `ignored`: keywords that count as not there."""
-    header = (_opened(file)[1] if with_image else _header(file)).copy()
+    header = (_read_image(file)[1] if with_image else _header(file)).copy()
     for keyword in ignored:
         header.remove(keyword, ignore_missing=True, remove_all=True)
     fields = _Reading(header)
@@ -173,7 +173,7 @@ def _stream(file: Path) -> Iterator[IO[bytes]]:
     yield held
 
 
-def _joined(first: Any, image: Any) -> Any:
+def _join_headers(first: Any, image: Any) -> Any:
     """Return the header of an image with what that of the file's beginning adds to it."""
     if image is first:
         return image.header
@@ -192,14 +192,14 @@ def _header(file: Path) -> Any:
             with _stream(file) as stream, fits.open(stream, memmap=False, lazy_load_hdus=True) as opened:
                 first = opened[0]
                 image = next((hdu for hdu in opened if getattr(hdu, "is_image", False) and hdu.header["NAXIS"]), first)
-                return _joined(first, image)
+                return _join_headers(first, image)
         except InputError:
             raise
         except Exception as error:
             raise InputError(f"damaged FITS ({one_line(error)}); copy it again or recapture") from error
 
 
-def _opened(file: Path) -> tuple[NDArray[Any], Any]:
+def _read_image(file: Path) -> tuple[NDArray[Any], Any]:
     """Return the image's values and header. A file whose data or checksum is damaged is refused."""
     from astropy.io import fits
     from astropy.io.fits.verify import VerifyWarning
@@ -212,7 +212,7 @@ def _opened(file: Path) -> tuple[NDArray[Any], Any]:
             with _stream(file) as stream, fits.open(stream, memmap=False, checksum=True) as opened:
                 images = [hdu for hdu in opened if getattr(hdu, "is_image", False) and hdu.data is not None]
                 names = [hdu.name or f"extension {opened.index_of(hdu)}" for hdu in images]
-                values_and_headers = [(np.asarray(hdu.data), _joined(opened[0], hdu)) for hdu in images]
+                values_and_headers = [(np.asarray(hdu.data), _join_headers(opened[0], hdu)) for hdu in images]
         except InputError:
             raise
         except Exception as error:

@@ -152,8 +152,9 @@ def _unlisted(frames_of_side: Sequence[StatedFrame], where: str) -> Iterator[str
             values = _values(keyword, group)
             if 1 < len(values) < sum(map(len, values.values())):
                 yield (
-                    f"{where}: {keyword} differs between frames that are fitted together: {_listed(values)}; where it "
-                    f"is a setting of the camera, import one group, --only {keyword}={text_of(next(iter(values)))}"
+                    f"{where}: {keyword} differs between frames that are fitted together: {_format_values(values)}; "
+                    f"where it is a setting of the camera, import one group, "
+                    f"--only {keyword}={text_of(next(iter(values)))}"
                 )
                 break
 
@@ -202,7 +203,7 @@ def _values(keyword: str, frames: Sequence[StatedFrame]) -> dict[Value, list[Sta
 def _difference(
     setting: FrameSetting, keyword: str, values: Mapping[Value, Sequence[StatedFrame]], where: str, is_problem: bool
 ) -> str:
-    listed = _listed(values)
+    listed = _format_values(values)
     if not is_problem:
         return (
             f"{where}: {keyword} ({setting.name}) differs between frames: {listed}; each is fitted by itself, and all "
@@ -219,11 +220,11 @@ def _difference(
     )
 
 
-def _listed(values: Mapping[Value, Sequence[StatedFrame]]) -> str:
-    return ", ".join(f"{text_of(value)} in {_named(frames)}" for value, frames in values.items())
+def _format_values(values: Mapping[Value, Sequence[StatedFrame]]) -> str:
+    return ", ".join(f"{text_of(value)} in {_name_frames(frames)}" for value, frames in values.items())
 
 
-def _named(frames: Sequence[StatedFrame]) -> str:
+def _name_frames(frames: Sequence[StatedFrame]) -> str:
     names = [frame.file.name for frame in frames]
     listed = ", ".join(names[:2]) + (f" .. {names[-1]}" if len(names) > 2 else "")
     return f"{len(names)} frame{'s' if len(names) > 1 else ''} ({listed})"

@@ -115,7 +115,7 @@ def _fits_facts(file: Path, ignored: Collection[str]) -> SensorFacts:
     return SensorFacts(header.cfa, mosaic_source=header.mosaic_source)
 
 
-def known_from_file(file: Path, shape: tuple[int, int], ignored: Collection[str] = ()) -> dict[str, Any]:
+def read_known_keys(file: Path, shape: tuple[int, int], ignored: Collection[str] = ()) -> dict[str, Any]:
     """Return the keys of a camera that a frame's file states, for a camera file that leaves them out."""
     facts = sensor_facts(file, shape, ignored)
     bits = picture_facts(file).bits if file.suffix.lower() in TIFFS else None
@@ -123,7 +123,7 @@ def known_from_file(file: Path, shape: tuple[int, int], ignored: Collection[str]
     return {key: value for key, value in known.items() if value is not None}
 
 
-def taken_from_file(stated: Collection[str], known: Mapping[str, Any], file: Path) -> list[str]:
+def list_keys_taken(stated: Collection[str], known: Mapping[str, Any], file: Path) -> list[str]:
     """Return the line for keys of a camera that aren't `stated` and that its first frame's file has (`known`)."""
     taken = [f"{key} = {_text(value)}" for key, value in known.items() if key not in stated]
     return [f"{file}: {', '.join(taken)}: not stated, and taken from this file"] if taken else []

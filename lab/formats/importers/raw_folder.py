@@ -35,7 +35,6 @@ from lab.formats.importers.images import (
     Readout,
     Tap,
     TapFiles,
-    described_sides,
     frame_name,
     grey,
     has_alpha,
@@ -43,9 +42,10 @@ from lab.formats.importers.images import (
     parse_taps,
     read_camera_file,
     read_image,
+    read_sides,
     readout,
 )
-from lab.formats.importers.own_statements import compare_with_files, known_from_file, taken_from_file
+from lab.formats.importers.own_statements import compare_with_files, list_keys_taken, read_known_keys
 from lab.formats.importers.stated_settings import check_against_frames, frame_header
 from lab.formats.pictures import IMAGES, TIFFS, picture_facts, read_picture
 from lab.formats.recording_set import DataSheet, Manifest, RecordingError, RecordingSet, parse_manifest
@@ -198,7 +198,7 @@ def recordings_of_index(
     if not cameras.is_file():
         raise InputError(f"{cameras}: missing; write the camera's keys, `cfa` at least")
     taps: dict[Side, tuple[Tap, ...]] = {}
-    for side, keys in described_sides(cameras).items():
+    for side, keys in read_sides(cameras).items():
         listed = parse_taps(keys.get("taps", ()), str(cameras))
         taps[side] = tuple(tap_of_side for tap_of_side in listed if tap_of_side.name == tap) if tap else listed
         if tap and not taps[side]:
@@ -323,9 +323,9 @@ def _recording_set(
     taps: Mapping[Side, tuple[Tap, ...]] = {},
     choice: HeaderChoice = ALL_FRAMES,
 ) -> RecordingSet:
-    listed = _listed_frames(path, index, where)
+    listed = _list_frames(path, index, where)
     captures, images, numbers = listed.captures, listed.images, listed.numbers
-    measured, known, remarks = _measured(listed, choice.ignored)
+    measured, known, remarks = _measure_frames(listed, choice.ignored)
     if listed.stacks:
         more = f" and {len(listed.stacks) - 3} more" if len(listed.stacks) > 3 else ""
         remarks.append(
@@ -365,13 +365,13 @@ def _recording_set(
     remarks += remarks_on(path, _spectra(manifest))
     manifest, said = check_against_frames(manifest, images, where, choice)
     remarks += said
-    statements = described_sides(path / CAMERA)
+    statements = read_sides(path / CAMERA)
     for side, camera in described.items():
         files = {images[capture["frame"]]: capture["kind"] for capture in captures if capture["side"] == side}
         stated = statements.get(side, {})
         if files:
             boards = [file for file, kind in files.items() if kind == "charuco"]
-            remarks += taken_from_file(stated, known[side], next(iter(files)))
+            remarks += list_keys_taken(stated, known[side], next(iter(files)))
             remarks += compare_with_files(camera, stated, files, boards, choice.ignored, is_whole=side not in readouts)
     by_frame = {capture["frame"]: readouts[capture["side"]] for capture in captures if capture["side"] in readouts}
     return RecordingSet(
@@ -396,7 +396,7 @@ class _ListedFrames:
     renamed: list[str] = field(default_factory=list)
 
 
-def _listed_frames(path: Path, index: Index, where: str) -> _ListedFrames:
+def _list_frames(path: Path, index: Index, where: str) -> _ListedFrames:
     """Return the captures of an index with ids that are unique where the rows state none. Raises RecordingError with
     one line for each row whose frame can't be used."""
     listed = _ListedFrames()
@@ -418,7 +418,7 @@ def _listed_frames(path: Path, index: Index, where: str) -> _ListedFrames:
         if many > 1:
             listed.stacks.append(f"{capture['frame']} ({many})")
         for page in range(many):
-            name = _unused(stem if many == 1 else f"{stem}-p{page + 1}", used)
+            name = _make_unique(stem if many == 1 else f"{stem}-p{page + 1}", used)
             frame = f"frames/{name}.npy"
             keys = {"id": name, "side": "left", "exposure_s": None} | capture | {"frame": frame}
             if many > 1:
@@ -438,7 +438,7 @@ def _stem(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name)
 
 
-def _unused(name: str, used: set[str]) -> str:
+def _make_unique(name: str, used: set[str]) -> str:
     """Return the name, with the first number behind it that makes it a new one where it is used; it is used from now
     on."""
     numbered = (name if number == 1 else f"{name}-{number}" for number in count(1))
@@ -476,7 +476,7 @@ def _spectra(manifest: Manifest) -> list[str]:
     return list(dict.fromkeys(named))
 
 
-def _measured(
+def _measure_frames(
     listed: _ListedFrames, ignored: Collection[str]
 ) -> tuple[dict[Side, dict[str, Any]], dict[Side, dict[str, Any]], list[str]]:
     """What each side's first image tells and `camera.toml` may leave out: rows and columns, and the bit depth of files
@@ -493,7 +493,7 @@ def _measured(
         try:
             image = read_picture(first, listed.pages.get(name)) if first.suffix.lower() in IMAGES else None
             frame = read_image(first, listed.pages.get(name)) if image is None else grey(image)
-            known[side] = known_from_file(first, (frame.shape[0], frame.shape[1]), ignored)
+            known[side] = read_known_keys(first, (frame.shape[0], frame.shape[1]), ignored)
         except InputError as error:
             raise InputError(f"{first}: {error}") from error
         measured[side] = {"rows": frame.shape[0], "cols": frame.shape[1]}

@@ -21,12 +21,12 @@ from pydantic import ValidationError
 
 from lab.errors import InputError
 from lab.formats.cgats import read_foreign_csv
-from lab.formats.importers.images import codes_of, described_sides, has_alpha, read_image
+from lab.formats.importers.images import codes_of, has_alpha, read_image, read_sides
 from lab.formats.importers.own_statements import (
     compare_with_files,
-    known_from_file,
+    list_keys_taken,
+    read_known_keys,
     subsampling_remark,
-    taken_from_file,
 )
 from lab.formats.importers.stated_settings import check_against_frames
 from lab.formats.pictures import IMAGES, picture_facts, read_picture
@@ -118,10 +118,10 @@ def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
     """
     lit = options.light is None and options.white_patch is None
     missing = ("--light or --white-patch (CSV of the light's radiance)",) if lit else ()
-    frame, camera, notes = read_picture_and_camera(path, options, _remosaiced, missing)
+    frame, camera, notes = read_picture_and_camera(path, options, _remosaic, missing)
     corners = options.corners
     if corners is None:
-        corners = located_chart(frame, camera)
+        corners = locate_chart(frame, camera)
         if corners is None:
             raise InputError(f"{path}: no ColorChecker of 24 patches found; give its --corners")
         said = " ".join(f"{value:.0f}" for corner in corners for value in corner)
@@ -132,7 +132,7 @@ def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
     return build_recording_set(path, frame, camera, options, capture, (*notes, *remarks), {"spectra/light.csv": light})
 
 
-def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
+def locate_chart(frame: Frame, camera: DataSheet) -> Corners | None:
     """Corners of the grid of patches, [row, col] of dark skin, bluish green, black, white; None where no chart is
     found.
 
@@ -197,11 +197,11 @@ def read_picture_and_camera(
     `plane_of`: frame and mosaic of a colour picture (rows, cols, 3) in R, G, B."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; give one picture")
-    file, keys = _stated_camera(path, options)
+    file, keys = _read_stated_camera(path, options)
     is_image = path.suffix.lower() in IMAGES
     with _about(path):
         image = read_picture(path) if is_image else read_image(path)
-        known = known_from_file(path, (image.shape[0], image.shape[1]))
+        known = read_known_keys(path, (image.shape[0], image.shape[1]))
         colours = image.ndim == 3 and image.shape[2] >= 3 and bool(np.ptp(image[..., :3], axis=2).any())
         notes = _refuse_mixed_channels(path, options) if is_image and colours else ()
     stated = frozenset(keys)
@@ -215,7 +215,7 @@ def read_picture_and_camera(
         image, keys["cfa"] = plane_of(image[..., :3])
         notes += (f"{path}: a colour picture: its pixels are no mosaic's, and neighbours share their noise",)
     else:
-        notes += tuple(taken_from_file(stated, known, path))
+        notes += tuple(list_keys_taken(stated, known, path))
     with _about(path):
         frame = codes_of(image[..., 0] if image.ndim == 3 else image)
     camera = _camera_of(file, keys, frame)
@@ -281,12 +281,12 @@ def _camera_of(file: Path, keys: Mapping[str, Any], frame: Frame) -> DataSheet:
         raise InputError(f"{file}: {'.'.join(map(str, first['loc']))}: {first['msg']}; correct it") from error
 
 
-def _stated_camera(path: Path, options: ImportOptions) -> tuple[Path, dict[str, Any]]:
+def _read_stated_camera(path: Path, options: ImportOptions) -> tuple[Path, dict[str, Any]]:
     """Return the camera file of a picture, and its keys."""
     file = options.camera if options.camera is not None else path.parent / CAMERA
     if options.camera is not None and not file.is_file():
         raise InputError(f"{file}: no such file; give the camera file of --camera")
-    sides = described_sides(file)
+    sides = read_sides(file)
     if "left" not in sides:
         raise InputError(f"{file}: describes no left camera; write the keys without a table")
     return file, dict(sides["left"])
@@ -315,7 +315,7 @@ def take_channel(image: NDArray[Any], options: ImportOptions) -> tuple[Frame, st
     return image[..., "RGB".index(options.channel)], "MONO"
 
 
-def _remosaiced(image: NDArray[Any]) -> tuple[Frame, str]:
+def _remosaic(image: NDArray[Any]) -> tuple[Frame, str]:
     """Return a colour picture (rows, cols, 3) sampled like a mosaic."""
     rows, cols = (n // 2 * 2 for n in image.shape[:2])
     made = np.empty((rows, cols), image.dtype)
