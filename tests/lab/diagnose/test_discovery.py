@@ -305,9 +305,9 @@ def test_a_mismatch_without_a_name_gets_a_law_along_its_coordinate(
 
 @pytest.mark.extra
 def test_a_mismatch_that_nothing_predicts_says_what_would_help() -> None:
-    """Code densities don't follow so strong a pattern, either (open): they aren't what is asked here."""
     camera = ConcealedCamera(772302, (TreeRingsLaw(3.0),), cfa="MONO", rows=128, cols=192)
     found = diagnose(recordings_of(camera, LIT_AND_DARK), None)
+    assert "code_density" not in {item.measurement for item in found.unexplained}
     (alone,) = [item for item in found.unexplained if item.measurement == "flat_pattern"]
     assert alone.shape.startswith("irregular")
     assert alone.would_help.startswith("Nothing that was tried predicts it")
