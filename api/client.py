@@ -244,7 +244,7 @@ class ServiceClient:
             raise _problem(response)
         return response
 
-    def _fetched(self, path: str, file: Path) -> Path:
+    def _fetch(self, path: str, file: Path) -> Path:
         """Write the archive of a path to `file`, a .tar where its name ends so, else a .zip, as it arrives: completely,
         or not at all."""
         partial = file.with_name(f".{file.name}.partial")
@@ -305,7 +305,7 @@ class ServiceClient:
                 return
             response = self.request("GET", f"{self.url}{following}")
 
-    def _ended(self, what: str, look: Callable[[], W], ends: tuple[str, ...], patience_s: float) -> W:
+    def _wait_for_end(self, what: str, look: Callable[[], W], ends: tuple[str, ...], patience_s: float) -> W:
         """Return what `look` finds once its state is one of `ends`. Raises ServiceProblem unless that is the first of
         them, the good one."""
         until = time.monotonic() + patience_s
@@ -470,7 +470,7 @@ class ServiceClient:
     def wait_session(self, session_id: str, patience_s: float = PATIENCE_S) -> SessionDetail:
         """Wait until a session's run is over. Raises ServiceProblem unless it finished."""
         ends = ("finished", "interrupted", "failed")
-        return self._ended(f"session {session_id}", lambda: self.session(session_id), ends, patience_s)
+        return self._wait_for_end(f"session {session_id}", lambda: self.session(session_id), ends, patience_s)
 
     def capture(
         self,
@@ -594,7 +594,7 @@ class ServiceClient:
 
     def fetch_recordings(self, recordings_id: str, file: Path) -> Path:
         """Write a recording set that was sent in to `file`, a .zip or .tar."""
-        return self._fetched(f"/recordings/{recordings_id}/archive", file)
+        return self._fetch(f"/recordings/{recordings_id}/archive", file)
 
     def delete_recordings(self, recordings_id: str) -> None:
         """Delete a recording set for ever."""
@@ -602,7 +602,7 @@ class ServiceClient:
 
     def fetch_session(self, session_id: str, file: Path) -> Path:
         """Write a session to `file`, a .zip or .tar of a recording set."""
-        return self._fetched(f"/sessions/{session_id}/archive", file)
+        return self._fetch(f"/sessions/{session_id}/archive", file)
 
     def delete_session(self, session_id: str) -> None:
         """Delete a session for ever; its results and calibrations stay."""
@@ -646,9 +646,11 @@ class ServiceClient:
 
     def wait_job(self, job_id: str, patience_s: float = PATIENCE_S) -> Job:
         """Wait until a job is over. Raises ServiceProblem unless it is done."""
-        return self._ended(f"job {job_id}", lambda: self.job(job_id), ("done", "failed", "cancelled"), patience_s)
+        return self._wait_for_end(
+            f"job {job_id}", lambda: self.job(job_id), ("done", "failed", "cancelled"), patience_s
+        )
 
-    def _made(
+    def _make(
         self, model: type[M], kind: JobKind, source: Source, patience_s: float, engine: Engine = DEFAULT_ENGINE
     ) -> M:
         start = self.start_recordings_job if isinstance(source, Recordings) else self.start_job
@@ -657,18 +659,18 @@ class ServiceClient:
 
     def fit(self, source: Source, patience_s: float = PATIENCE_S) -> FitResult:
         """Fit a finished session, or recordings that were sent in, and wait for the result."""
-        return self._made(FitResult, "fit", source, patience_s)
+        return self._make(FitResult, "fit", source, patience_s)
 
     def validate(self, source: Source, patience_s: float = PATIENCE_S) -> ValidationResult:
         """Validate the fit of a finished session, or of recordings, and wait for the result."""
-        return self._made(ValidationResult, "validate", source, patience_s)
+        return self._make(ValidationResult, "validate", source, patience_s)
 
     def diagnose(
         self, source: Source, patience_s: float = PATIENCE_S, *, engine: Engine = DEFAULT_ENGINE
     ) -> DiagnosisResult:
         """Diagnose a finished session, or recordings that were sent in, and wait for the result. `engine`: `evidence`
         or `today`."""
-        return self._made(DiagnosisResult, "diagnose", source, patience_s, engine)
+        return self._make(DiagnosisResult, "diagnose", source, patience_s, engine)
 
     def findings(self, session_id: str) -> DiagnosisFindings:
         """Return what a session's newest diagnosis found, in words."""
@@ -745,7 +747,7 @@ class ServiceClient:
 
     def fetch_camera_model(self, model_id: str, file: Path) -> Path:
         """Write the camera files of a model to `file`, a .zip or .tar."""
-        return self._fetched(f"/camera-models/{model_id}/archive", file)
+        return self._fetch(f"/camera-models/{model_id}/archive", file)
 
     def predict(self, asked: PredictionStart) -> StoredPrediction:
         """Predict a session that hasn't been captured, and seal that."""

@@ -80,7 +80,7 @@ def answers(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {status: {"description": _MEANINGS[status], "content": content} for status in statuses}
 
 
-def known(what: str, look: Callable[[], T]) -> T:
+def find_or_404(what: str, look: Callable[[], T]) -> T:
     """Return the result of `look`. Raises 404 with `what` as its one line where `look` raises InputError."""
     try:
         return look()
@@ -155,15 +155,17 @@ def _of_field(expected: Expected, problem: Mapping[str, Any]) -> str:
 def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     lines: list[str] = []
-    for one in error.errors():
-        if one["loc"][0] == "path" and one["type"] != "literal_error":
-            return _unknown_in_path(request, str(one["loc"][1]))
-        if one["type"] == "json_invalid":
-            lines.append(f"the body isn't JSON: {one['ctx']['error']}, at character {one['loc'][-1]}")
+    for detail in error.errors():
+        if detail["loc"][0] == "path" and detail["type"] != "literal_error":
+            return _unknown_in_path(request, str(detail["loc"][1]))
+        if detail["type"] == "json_invalid":
+            lines.append(f"the body isn't JSON: {detail['ctx']['error']}, at character {detail['loc'][-1]}")
             continue
-        where = ".".join(str(part) for part in one["loc"] if part != "body")
-        line = _not_as_expected(request, where, one)
-        if not any(other.startswith(f"{where}.") for other in lines):  # it follows from the line on a part of it
+        where = ".".join(str(part) for part in detail["loc"] if part != "body")
+        line = _not_as_expected(request, where, detail)
+        if not any(
+            known_line.startswith(f"{where}.") for known_line in lines
+        ):  # it follows from the line on a part of it
             lines.append(line)
     return problem(422, request.app.state.public("; ".join(lines)))
 

@@ -28,7 +28,7 @@ def stream(events: Callable[[anyio.Event], AsyncIterator[ServerSentEvent]]) -> E
     )
 
 
-async def watched(
+async def watch_state(
     look: Callable[[], BaseModel],
     over: Callable[[Any], bool],
     name: str,
@@ -56,7 +56,7 @@ async def watched(
             return
 
 
-def described(*events: tuple[str, type[BaseModel], str]) -> dict[int | str, dict[str, Any]]:
+def describe_events(*events: tuple[str, type[BaseModel], str]) -> dict[int | str, dict[str, Any]]:
     """OpenAPI's description of a stream: each event's name, its data, and when it is sent."""
     lines = [f"- `{name}`: {when}; its data is a `{model.__name__}`." for name, model, when in events]
     schema = {

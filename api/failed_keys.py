@@ -53,7 +53,7 @@ class FailedKeys:
             left = self._now(network_of(address))
         return 0 if left >= 1.0 else math.ceil((1.0 - left) / self.per_s)
 
-    def failed(self, address: str) -> None:
+    def count_failure(self, address: str) -> None:
         """Count a key that wasn't valid."""
         network = network_of(address)
         with self._lock:

@@ -79,15 +79,15 @@ class Foreign:
         stated = self.statements
         there = replace(
             stated,
-            camera=stated.camera and self._located(folder, "camera", str(stated.camera)),
-            light=stated.light and self._located(folder, "light", str(stated.light)),
-            white_patch=stated.white_patch and self._located(folder, "white_patch", str(stated.white_patch)),
+            camera=stated.camera and self._locate(folder, "camera", str(stated.camera)),
+            light=stated.light and self._locate(folder, "light", str(stated.light)),
+            white_patch=stated.white_patch and self._locate(folder, "white_patch", str(stated.white_patch)),
         )
-        at = self._located(folder, "path", self.path, a_file=of_a_file) if self.path else folder
+        at = self._locate(folder, "path", self.path, a_file=of_a_file) if self.path else folder
         return read_foreign(self.format, at, there)
 
     @staticmethod
-    def _located(folder: Path, name: str, path: str, a_file: bool = True) -> Path:
+    def _locate(folder: Path, name: str, path: str, a_file: bool = True) -> Path:
         """Return a file or folder of the archive. Raises InputError where it isn't in it."""
         named = inside(path)
         place = folder / named
@@ -209,8 +209,8 @@ def _top(folder: Path, holds: str | None = _MANIFEST) -> Path:
     file is beside it."""
     entries = list(folder.iterdir())
     inner = [entry for entry in entries if entry.is_dir()]
-    here = (folder / holds).exists() if holds is not None else len(entries) > 1
-    return inner[0] if not here and len(inner) == 1 else folder
+    is_holder = (folder / holds).exists() if holds is not None else len(entries) > 1
+    return inner[0] if not is_holder and len(inner) == 1 else folder
 
 
 def as_in_archive(text: str, place: Path) -> str:

@@ -172,12 +172,12 @@ class Pipe:
         """Release the device."""
 
 
-def timed_out() -> usb.core.USBTimeoutError:
+def timeout_error() -> usb.core.USBTimeoutError:
     """Return the exception that pyusb's own backends raise on a time-out."""
     return usb.core.USBTimeoutError("Operation timed out", error_code=-7, errno=errno.ETIMEDOUT)
 
 
-def failed(status: int, what: str) -> usb.core.USBError:
+def usb_error(status: int, what: str) -> usb.core.USBError:
     """Return a USB error of an errno (positive)."""
     return usb.core.USBError(f"{what}: {errno.errorcode.get(status, status)}", errno=status)
 
@@ -371,7 +371,7 @@ class TcpPipe(Pipe):
         urb = _PendingUrb(incoming)
         with self._lock:
             if self._closed:
-                raise failed(errno.ENODEV, "the USB/IP connection is closed")
+                raise usb_error(errno.ENODEV, "the USB/IP connection is closed")
             number = next(self._sequence)
             self._pending[number] = urb
             size = length if data is None else len(data)
@@ -382,17 +382,17 @@ class TcpPipe(Pipe):
                 self._socket.sendall(head + SUBMIT.pack(0, size, 0, NOT_ISOCHRONOUS, 0, setup) + (data or b""))
             except OSError as error:
                 self._pending.pop(number, None)
-                raise failed(errno.ENODEV, f"the USB/IP connection broke ({error})") from error
+                raise usb_error(errno.ENODEV, f"the USB/IP connection broke ({error})") from error
         if not urb.done.wait(timeout_ms / 1000 if timeout_ms > 0 else None):
             self._unlink(number, urb)
             if urb.status == -errno.ECONNRESET or not urb.done.is_set():
-                raise timed_out()
+                raise timeout_error()
         if urb.status == -errno.ETIMEDOUT:
-            raise timed_out()
+            raise timeout_error()
         if urb.status:
-            raise failed(-urb.status, f"USB transfer on endpoint {endpoint:#04x}")
+            raise usb_error(-urb.status, f"USB transfer on endpoint {endpoint:#04x}")
         if len(urb.data) > length and incoming:
-            raise failed(errno.EOVERFLOW, f"USB transfer on endpoint {endpoint:#04x}")
+            raise usb_error(errno.EOVERFLOW, f"USB transfer on endpoint {endpoint:#04x}")
         return urb.data
 
     def _unlink(self, number: int, urb: _PendingUrb) -> None:
@@ -470,7 +470,7 @@ class UsbIpBackend(PipeBackend):
         try:
             connection = socket.create_connection((self.host, self.port), self.timeout_s)
         except OSError as error:
-            raise failed(
+            raise usb_error(
                 errno.ENODEV, f"no USB/IP server at {self.host}:{self.port} ({error.strerror or error})"
             ) from error
         try:
@@ -478,16 +478,16 @@ class UsbIpBackend(PipeBackend):
             connection.sendall(OP_HEADER.pack(VERSION, command, 0) + body)
             version, answer, status = OP_HEADER.unpack(receive_exactly(connection, OP_HEADER.size))
             if version != VERSION or answer != command & 0x7FFF:
-                raise failed(
+                raise usb_error(
                     errno.EPROTO, f"{self.host}:{self.port} answered {version:#06x} {answer:#06x}: not USB/IP 1.1.1"
                 )
             if status:
-                raise failed(errno.EBUSY, f"{self.host}:{self.port} refused the device with status {status}")
+                raise usb_error(errno.EBUSY, f"{self.host}:{self.port} refused the device with status {status}")
         except OSError as error:
             connection.close()
             if isinstance(error, usb.core.USBError):
                 raise
-            raise failed(errno.EPROTO, f"no answer from {self.host}:{self.port} ({error})") from error
+            raise usb_error(errno.EPROTO, f"no answer from {self.host}:{self.port} ({error})") from error
         return connection
 
     def devices(self) -> list[RemoteDevice]:
@@ -501,7 +501,7 @@ class UsbIpBackend(PipeBackend):
                     bus_id = fields[1].split(b"\0", 1)[0]
                     devices.append(RemoteDevice(fields[2], fields[3], fields[4], bus_id))
             except OSError as error:
-                raise failed(errno.EPROTO, f"the list of {self.host}:{self.port} broke off ({error})") from error
+                raise usb_error(errno.EPROTO, f"the list of {self.host}:{self.port} broke off ({error})") from error
         return devices
 
     def open_pipe(self, device: RemoteDevice) -> TcpPipe:
@@ -517,7 +517,7 @@ class UsbIpBackend(PipeBackend):
             receive_exactly(connection, DEVICE.size)
         except OSError as error:
             connection.close()
-            raise failed(errno.EPROTO, f"{self.host}:{self.port} broke off ({error})") from error
+            raise usb_error(errno.EPROTO, f"{self.host}:{self.port} broke off ({error})") from error
         connection.settimeout(
             None
         )  # the thread waits for as long as the device is open; requests have their own time-outs

@@ -573,8 +573,8 @@ class U3vDevice(UsbDevice):
         payload = encode(raw[top : top + rows, left : left + cols], pixel_format)
         fault = self._failing(*_OF_FRAMES)
         seconds: float | None = None
-        for told in self._faults_of_answer():
-            fault, seconds = _AS_FRAMES[told.kind], told.value
+        for fault_of_answer in self._faults_of_answer():
+            fault, seconds = _AS_FRAMES[fault_of_answer.kind], fault_of_answer.value
         if fault == "missed":
             return
         frame_id, self._frame_id = self._frame_id, self._frame_id + 1

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
-from drivers.usbip import Pipe, PipeBackend, RemoteDevice, failed, timed_out
+from drivers.usbip import Pipe, PipeBackend, RemoteDevice, timeout_error, usb_error
 from mocks.bench import Bench
 from mocks.cornerstone260b import MockCornerstone260B
 from mocks.ready_frames import BeforeCameras
@@ -77,9 +77,9 @@ class InProcessPipe(Pipe):
         try:
             return self._device.transfer(endpoint, setup, data, length, lambda: time.monotonic() > deadline)
         except Abandoned:
-            raise timed_out() from None
+            raise timeout_error() from None
         except UsbFault as fault:
-            raise failed(-fault.status, f"mock USB transfer on endpoint {endpoint:#04x}") from fault
+            raise usb_error(-fault.status, f"mock USB transfer on endpoint {endpoint:#04x}") from fault
 
     def close(self) -> None:
         """Nothing is held."""

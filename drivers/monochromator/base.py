@@ -196,14 +196,14 @@ class Monochromator(Instrument):
 SLIT_LIMITS_UM = (4.0, 3000.0)
 
 
-def checked_slit_um(width_um: float) -> float:
+def check_slit_um(width_um: float) -> float:
     """Check a slit width.
 
     width_um : um
 
     Returns it. Raises `InstrumentError` where the slits can't be set to it (a NaN included).
 
-    >>> checked_slit_um(500.0)
+    >>> check_slit_um(500.0)
     500.0
     """
     low, high = SLIT_LIMITS_UM
@@ -266,14 +266,14 @@ def lines_per_mm(text: str, who: str) -> float:
     return lines
 
 
-def checked_wavelength_nm(wavelength_nm: float, upper_nm: float) -> float:
+def check_wavelength_nm(wavelength_nm: float, upper_nm: float) -> float:
     """Check a wavelength.
 
     wavelength_nm, upper_nm : nm, and the highest that the grating reaches
 
     Returns it. Raises `InstrumentError` where the grating can't go there (a NaN included).
 
-    >>> checked_wavelength_nm(550.0, 1400.0)
+    >>> check_wavelength_nm(550.0, 1400.0)
     550.0
     """
     if not (math.isfinite(wavelength_nm) and 0.0 <= wavelength_nm <= upper_nm):

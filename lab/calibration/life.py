@@ -27,7 +27,7 @@ from lab.calibration.limits import (
     Limit,
     Mark,
     figures_of,
-    judged,
+    judge_figures,
 )
 from lab.capture.records import RunRecord, now
 from lab.capture.station import Station
@@ -189,15 +189,15 @@ def check_certified(store: Store, instruments: Snapshots, station: Station) -> N
         if expired and expired[0].expires
         else f"{len(history)} calibrations of it are known, none is certified"
     )
-    for other in [
+    for certified in [
         calibration
         for calibration in others
         if calibration.state == "certified" and calibration.cameras.keys() == cameras.keys()
     ][:1]:
         changed = [
-            f"{side} was {was}, is {cameras[side]}" for side, was in other.cameras.items() if was != cameras[side]
+            f"{side} was {was}, is {cameras[side]}" for side, was in certified.cameras.items() if was != cameras[side]
         ]
-        why += f" (the newest certified one, {other.id}, is of other cameras: {'; '.join(changed)})"
+        why += f" (the newest certified one, {certified.id}, is of other cameras: {'; '.join(changed)})"
     raise InputError(
         f"cameras {', '.join(cameras.values())}: the session demands a certified calibration, and {why}; certify one "
         "with "
@@ -410,11 +410,11 @@ def certify(
         raise InputError(
             f"calibration {wanted.id}: is {wanted.state}, only a candidate can be certified; fit the session again"
         )
-    judgements = judged(figures(store, wanted.id), limits)
+    judgements = judge_figures(figures(store, wanted.id), limits)
     refused = ("bad", "missing") if accept_warnings else ("warn", "bad", "missing")
     if lines := [_refusal(wanted.id, judgement) for judgement in judgements if judgement.mark in refused]:
         raise InputError("\n".join(lines))
-    drafts, whence = drafted_limits(store, wanted.id)
+    drafts, whence = draft_limits(store, wanted.id)
     bands = {(draft.figure, draft.side, draft.place, draft.good) for draft in drafts}
     is_drafted = any((limit.figure, limit.side, limit.place, limit.good) in bands for limit in limits.limit)
     limits = limits.model_copy(update={"drafted_from": whence if is_drafted else ()})
@@ -732,7 +732,7 @@ DRAFTED_FROM, DRAFTED_LEAST = 30, 3
 DRAFTED_COVERAGE = 1.0 - FALSE_ALARM_RATE
 
 
-def drafted_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], tuple[str, ...]]:
+def draft_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], tuple[str, ...]]:
     """Limits drafted from what the cameras of a calibration had before it, and the ids of the calibrations that they
     were drafted from, the newest last.
 

@@ -174,7 +174,7 @@ class Judgement(Frozen):
     mark: Mark
 
 
-def judged(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judgement, ...]:
+def judge_figures(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judgement, ...]:
     """Every figure that a limit concerns, in the order of the limits."""
     judgements: list[Judgement] = []
     for limit in limits.limit:

@@ -75,17 +75,17 @@ class PlanEstimate(Frozen):
 
 def catalogue() -> tuple[SequenceDescription, ...]:
     """All sequences, in the order of a full session."""
-    return tuple(map(_described, SEQUENCES.values()))
+    return tuple(map(_describe, SEQUENCES.values()))
 
 
-def described(name: str) -> SequenceDescription:
+def describe_sequence(name: str) -> SequenceDescription:
     """One sequence. Raises InputError for an unknown name."""
     if name not in SEQUENCES:
         raise InputError(f"no sequence {name[:60]!r}; there are {', '.join(SEQUENCES)}")
-    return _described(SEQUENCES[name])
+    return _describe(SEQUENCES[name])
 
 
-def _described(kind: type[Sequence]) -> SequenceDescription:
+def _describe(kind: type[Sequence]) -> SequenceDescription:
     return SequenceDescription(
         name=kind.name,
         purpose=kind.purpose,
@@ -114,7 +114,7 @@ def parse_parameters(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
         sequence, _, parameter = name.strip().partition(".")
         if sequence not in SEQUENCES or not parameter or not value:
             raise InputError(f"{text!r}: give SEQUENCE.PARAMETER=VALUE, of a sequence of {', '.join(SEQUENCES)}")
-        several = {parameter.name for parameter in described(sequence).parameters if parameter.several}
+        several = {parameter.name for parameter in describe_sequence(sequence).parameters if parameter.several}
         try:
             numbers = [float(part) for part in value.split(",")]
         except ValueError:
@@ -152,7 +152,7 @@ class StepTimes:
     per_exposure: float = 1.0
 
     @classmethod
-    def learned(cls, seen: Iterable[tuple[Step, float]]) -> StepTimes:
+    def learn(cls, seen: Iterable[tuple[Step, float]]) -> StepTimes:
         """From steps and how long (s) each took."""
         taken = [(_work(step), _exposure_s(step), seconds) for step, seconds in seen]
         per_exposure = 1.0
@@ -185,7 +185,7 @@ def step_times(store: Store, station: Station) -> StepTimes:
             StepRow.session_id.in_(same), StepRow.started.is_not(None), StepRow.finished.is_not(None)
         )
         rows = db.execute(steps).all()
-    return StepTimes.learned(
+    return StepTimes.learn(
         (Step.model_validate(spec), (finished - started).total_seconds()) for spec, started, finished in rows
     )
 

@@ -160,7 +160,7 @@ class Rescue:
         for station in self._stations:
             station.stop_others()
 
-    def made_safe(self, patience_s: float) -> dict[str, Lock]:
+    def wait_until_safe(self, patience_s: float) -> dict[str, Lock]:
         """Wait, for `patience_s` at most, for the instruments. The sessions whose stations are safe, with their locks,
         which are held; those of the others are released, as the recovery takes them while an instrument that doesn't
         answer is still waited for here."""
@@ -197,10 +197,10 @@ def _say(line: str) -> None:
     print(escaped(line), file=sys.stderr, flush=True)
 
 
-def made_safe_at_start() -> dict[str, Lock]:
+def wait_until_safe_at_start() -> dict[str, Lock]:
     """Return the sessions whose stations `make_safe_at_start` made safe, with their locks, which are held. To be called
     before somebody else speaks to the same instruments."""
-    return {name: lock for rescue in _at_start for name, lock in rescue.made_safe(INSTRUMENTS_S).items()}
+    return {name: lock for rescue in _at_start for name, lock in rescue.wait_until_safe(INSTRUMENTS_S).items()}
 
 
 def _check_shut(monochromator: Any) -> None:

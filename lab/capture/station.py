@@ -119,11 +119,11 @@ class Station(Frozen):
                 continue
             # A port has several names: /dev/ttyUSB0, and a link in /dev/serial/by-id.
             port = str(Path(entry.address).resolve()) if entry.address.startswith("/") else entry.address
-            other = taken.setdefault(port, table)
-            if other != table:
+            first_table = taken.setdefault(port, table)
+            if first_table != table:
                 raise ValueError(
-                    f"[{other}] and [{table}] both have the address {port}; one port serves one instrument: correct "
-                    "one of them"
+                    f"[{first_table}] and [{table}] both have the address {port}; one port serves one instrument: "
+                    "correct one of them"
                 )
         return self
 

@@ -300,7 +300,7 @@ class Store:
             SessionRow.runs,
             SessionRow.request,
         )
-        asked = _searched(sa.select(SessionRow).options(*map(defer, documents)), search, only)
+        asked = _confine_query(sa.select(SessionRow).options(*map(defer, documents)), search, only)
         with self.reading() as db:
             if after is not None:
                 last = self._row(db, after)
@@ -312,7 +312,7 @@ class Store:
     def count_sessions(self, *, search: str = "", only: Sequence[str] | None = None) -> int:
         """Return how many sessions there are, of those that `sessions` answers."""
         with self.reading() as db:
-            return db.scalars(_searched(sa.select(sa.func.count()).select_from(SessionRow), search, only)).one()
+            return db.scalars(_confine_query(sa.select(sa.func.count()).select_from(SessionRow), search, only)).one()
 
     def describe_session(self, session_id: str, name: str | None = None, notes: str | None = None) -> None:
         """Give a session another name, or other notes; None leaves them. Raises InputError for control characters."""
@@ -365,8 +365,8 @@ class Store:
             station = row.station.get("name", "")
             asked = sa.select(SessionRow.id, SessionRow.station, SessionRow.runs)
             asked = asked.where(sa.tuple_(SessionRow.created, SessionRow.id) <= sa.tuple_(row.created, row.id))
-            for id, other, runs in db.execute(asked.order_by(SessionRow.created.desc(), SessionRow.id.desc())):
-                if runs and other.get("name", "") == station:
+            for id, station_keys, runs in db.execute(asked.order_by(SessionRow.created.desc(), SessionRow.id.desc())):
+                if runs and station_keys.get("name", "") == station:
                     return id, RunRecord.model_validate(runs[-1])
         return None
 
@@ -737,7 +737,7 @@ class Store:
             db.execute(sa.delete(HaltTokenRow).where(HaltTokenRow.sha256 == sha256))
 
 
-def _searched(asked: Any, search: str, only: Sequence[str] | None) -> Any:
+def _confine_query(asked: Any, search: str, only: Sequence[str] | None) -> Any:
     """Return a query of sessions, confined to those that have all words of a text, and to some ids."""
     for word in search.split():
         places = (SessionRow.id, SessionRow.name, SessionRow.notes, SessionRow.station["name"].as_string())

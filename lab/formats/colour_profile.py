@@ -44,9 +44,9 @@ def energy_sensitivities(camera: CameraModel) -> FloatArray:
     return np.asarray(curves / curves.max())
 
 
-def left_out(content: CameraFile) -> tuple[str, ...]:
+def list_losses(content: CameraFile) -> tuple[str, ...]:
     """Return a remark on the effects of a camera file, which its curves don't have."""
-    names = ", ".join(one.name for one in content.effects)
+    names = ", ".join(effect.name for effect in content.effects)
     return (f"the curves are those of quantum_efficiency: effects aren't in them ({names})",) if names else ()
 
 
@@ -73,7 +73,7 @@ def write_rawtoaces(file: Path, content: CameraFile) -> tuple[str, ...]:
     }
     with replacing(file) as partial:
         partial.write_text(json.dumps(document, indent=4) + "\n", encoding="utf-8")
-    return left_out(content)
+    return list_losses(content)
 
 
 def colour_matrices(camera: CameraModel, light: str) -> tuple[FloatArray, FloatArray]:
@@ -133,7 +133,7 @@ def write_dcp(file: Path, content: CameraFile) -> tuple[str, ...]:
     ]
     with replacing(file) as partial:
         partial.write_bytes(_tiff(entries))
-    return left_out(content)
+    return list_losses(content)
 
 
 def _ascii(tag: int, text: str) -> tuple[int, int, int, bytes]:
@@ -142,7 +142,7 @@ def _ascii(tag: int, text: str) -> tuple[int, int, int, bytes]:
 
 
 def _matrix(tag: int, matrix: FloatArray) -> tuple[int, int, int, bytes]:
-    numbers = [value for one in matrix.ravel() for value in (round(float(one) * _DENOMINATOR), _DENOMINATOR)]
+    numbers = [value for element in matrix.ravel() for value in (round(float(element) * _DENOMINATOR), _DENOMINATOR)]
     return tag, _SRATIONAL, 9, struct.pack("<18i", *numbers)
 
 
@@ -190,9 +190,9 @@ def write_icc(file: Path, content: CameraFile) -> tuple[str, ...]:
     )  # fmt: skip
     with replacing(file) as partial:
         partial.write_bytes(head + table + data)
-    return left_out(content)
+    return list_losses(content)
 
 
 def _xyz(value: FloatArray) -> bytes:
     """Return an XYZType of one colour, in s15Fixed16."""
-    return b"XYZ " + struct.pack(">4x3i", *(round(float(one) * 65536) for one in value))
+    return b"XYZ " + struct.pack(">4x3i", *(round(float(component) * 65536) for component in value))

@@ -59,13 +59,13 @@ class Provenance(Frozen):
 
 def installed_versions() -> dict[str, str]:
     """Versions of calibench, of the libraries that compute, and of Python."""
-    found = {"python": platform.python_version(), "system": platform.platform(terse=True)}
+    versions = {"python": platform.python_version(), "system": platform.platform(terse=True)}
     for name in DISTRIBUTIONS:
         try:
-            found[name] = metadata.version(name)
+            versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
 def provenance_of(recordings: RecordingSet, made: datetime | None = None) -> Provenance:

@@ -176,14 +176,14 @@ class GrowingCurves:
         camera = recordings.camera(capture.side)
         black, top = camera.black_level_dn or 0.0, camera.saturation_dn
         for name, plane in planes(frame, camera.cfa).items():
-            other = planes(before, camera.cfa)[name].astype(np.int32)
-            difference = plane.astype(np.int32) - other
+            earlier = planes(before, camera.cfa)[name].astype(np.int32)
+            difference = plane.astype(np.int32) - earlier
             self._transfer.append(
                 TransferPoint(
                     side=capture.side,
                     channel=name,
                     exposure_s=capture.exposure_s,
-                    mean_dn=float((plane.mean() + other.mean()) / 2.0 - black),
+                    mean_dn=float((plane.mean() + earlier.mean()) / 2.0 - black),
                     variance_dn2=float(difference.var() / 2.0),
                     saturated=bool(np.mean(plane >= top) > 1e-3),
                 )

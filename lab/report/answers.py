@@ -68,19 +68,19 @@ def _from_zero(value: ParameterValue, quantity: Quantity | None) -> str:
 def odds(diagnosis: DiagnosisResult | None) -> list[tuple[Side, list[tuple[str, float]]]]:
     """Return the probabilities of the models by side: the likeliest sets of effects, none further acting, and all the
     rest; and the rivals, where these aren't among the sets."""
-    found = []
-    for one in diagnosis.models if diagnosis is not None else ():
-        shown = one.sets[:ODDS]
+    likeliest_sets = []
+    for models in diagnosis.models if diagnosis is not None else ():
+        shown = models.sets[:ODDS]
         rows = [(set_in_words(item), item.probability) for item in shown]
         has_unlisted = diagnosis is not None and diagnosis.engine == "evidence"
         rest = "all other sets together" if has_unlisted else "all other sets of listed effects together"
         rows.append((rest, max(1.0 - sum(p for _, p in rows), 0.0)))
         for effect in diagnosis.effects if diagnosis is not None and not has_unlisted else ():
-            if one.side in effect.sides:
+            if models.side in effect.sides:
                 title = effect_title(effect.name)
                 rows += [(f"rival of {title}: {effect_title(r.name)}", r.probability) for r in effect.rivals]
-        found.append((one.side, rows))
-    return found
+        likeliest_sets.append((models.side, rows))
+    return likeliest_sets
 
 
 def set_in_words(item: EffectSet) -> str:
@@ -112,7 +112,7 @@ def effect_line(effect: NamedEffect) -> str:
     return f"{who}: {'; '.join(sizes)}." if sizes else f"{who}."
 
 
-def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
+def list_findings(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
     """Sentences: implausible figures, the named effects, mismatches without a name, and cameras without a mismatch."""
     yield from (f"Warning: {line}." for line in fit.warnings)
     if diagnosis is None:
@@ -164,9 +164,9 @@ def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
         return
     yield from (_sure_of(effect) for effect in diagnosis.effects[:NAMED])
     if diagnosis.engine == "evidence" and diagnosis.verdict == "no_mismatch":
-        for one in diagnosis.models:
-            nothing = sum(item.probability for item in one.sets if not item.effects and not item.unlisted)
-            yield f"No effect and nothing unlisted in the {one.side} camera: probability {nothing:.3f}."
+        for models in diagnosis.models:
+            nothing = sum(item.probability for item in models.sets if not item.effects and not item.unlisted)
+            yield f"No effect and nothing unlisted in the {models.side} camera: probability {nothing:.3f}."
     held = diagnosis.held_out
     if held is not None and held.n and (diagnosis.effects or diagnosis.discovered):
         laws = held.chi2_discovered
@@ -246,7 +246,7 @@ def to_do(
         yield f"{left_out} step{'s were' if left_out > 1 else ' was'} left out, each with its remedy, under Left out."
 
 
-def _missed(values: Sequence[float], curve: ResidualCurve) -> float:
+def _rms_residual(values: Sequence[float], curve: ResidualCurve) -> float:
     std = np.maximum(np.asarray(curve.measured_std), 1e-12)
     return float(np.sqrt(np.mean(np.square((np.asarray(curve.measured) - np.asarray(values)) / std))))
 
@@ -269,7 +269,7 @@ def proof_curves(diagnosis: DiagnosisResult) -> list[ResidualCurve]:
 
 def proof_words(curve: ResidualCurve) -> tuple[str, str]:
     """Title and caption of such a measurement."""
-    before, after = _missed(curve.before, curve), _missed(curve.after, curve)
+    before, after = _rms_residual(curve.before, curve), _rms_residual(curve.after, curve)
     title = measurement_title(curve.measurement)
     caption = (
         f"{curve.label}{', held out' if curve.held_out else ''}: rms residual {_short(before)} σ without the effects, "
@@ -346,7 +346,7 @@ def answers(
     """Return the four questions, each with its answers in sentences. `left_out`: number of skipped steps; `warnings`:
     number of warnings about the recordings."""
     return [
-        ("What was found", list(found(fit, diagnosis))),
+        ("What was found", list(list_findings(fit, diagnosis))),
         ("How sure", list(certainty(diagnosis))),
         ("What it means", list(meaning(diagnosis, validation, both))),
         ("What to do", list(to_do(diagnosis, left_out, warnings, fit.warnings))),

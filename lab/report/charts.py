@@ -29,7 +29,7 @@ from lab.formats.results import (
     ResidualCurve,
     SpectralFit,
 )
-from lab.formats.results.words import measured, plain_number
+from lab.formats.results.words import format_value, plain_number
 from lab.observables.observable import measurement_title
 from lab.predict.validate import SensitivityCurve
 from sim.camera import Side
@@ -159,7 +159,7 @@ def photon_transfer_points(points: PhotonTransfer, gain: float | None = None, ga
             {
                 "type": "scatter",
                 "mode": "lines",
-                "name": f"slope {measured(gain, gain_std, 'DN/e')}",
+                "name": f"slope {format_value(gain, gain_std, 'DN/e')}",
                 "x": [0.0, top],
                 "y": [0.0, gain * top],
                 "line": {"color": "@fg", "width": 1.5, "dash": "dash"},
@@ -254,30 +254,30 @@ def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[
     shapes: list[dict[str, Any]] = []
     notes: list[dict[str, Any]] = []
     channels = list(spectral.quantum_efficiency)
-    for one in spectral.maker_departures:
-        colour = CHANNEL.get(one.channel, "#888888")
+    for departure in spectral.maker_departures:
+        colour = CHANNEL.get(departure.channel, "#888888")
         half = 0.5 * float(np.median(np.diff(spectral.wavelength_nm)))
-        bottom = 0.95 - 0.055 * channels.index(one.channel)
-        at = {"x0": one.from_nm - half, "x1": one.to_nm + half}
+        bottom = 0.95 - 0.055 * channels.index(departure.channel)
+        at = {"x0": departure.from_nm - half, "x1": departure.to_nm + half}
         look = {"type": "rect", "fillcolor": _fade(colour), "line": {"width": 0}, "layer": "below"}
         shapes.append(look | at | {"yref": "paper", "y0": bottom, "y1": bottom + 0.05})
         shapes.append(look | at | {"yref": "paper", "y0": 0.0, "y1": bottom, "fillcolor": _fade(colour, 0.07)})
-        size = "new" if one.difference_percent is None else f"{one.difference_percent:+.1f} %"
-        if one.to_nm - one.from_nm + 2 * half < LABELLED_SHARE * (
+        size = "new" if departure.difference_percent is None else f"{departure.difference_percent:+.1f} %"
+        if departure.to_nm - departure.from_nm + 2 * half < LABELLED_SHARE * (
             spectral.wavelength_nm[-1] - spectral.wavelength_nm[0]
         ):
             continue  # no room for its label
         notes.append(
             {
-                "x": 0.5 * (one.from_nm + one.to_nm),
+                "x": 0.5 * (departure.from_nm + departure.to_nm),
                 "y": bottom + 0.025,
                 "yref": "paper",
                 "yanchor": "middle",
                 "text": size,
                 "showarrow": False,
                 "font": {"size": 10, "color": colour},
-                "hovertext": f"{one.channel}, {one.from_nm:g} to {one.to_nm:g} nm: {size}, "
-                f"{one.significance_sigma:.1f} sigma",
+                "hovertext": f"{departure.channel}, {departure.from_nm:g} to {departure.to_nm:g} nm: {size}, "
+                f"{departure.significance_sigma:.1f} sigma",
             }
         )
     return shapes, notes
@@ -344,7 +344,9 @@ def quantum_efficiency(
     shapes, notes = _departures(spectral)
     # Room above the curves for the strips, where there are any.
     highest = max(max(values) for values in spectral.quantum_efficiency.values())
-    highest = max([highest, *(max(*one.baseline, *one.improved) for one in (models or {}).values())])
+    highest = max(
+        [highest, *(max(*sensitivity.baseline, *sensitivity.improved) for sensitivity in (models or {}).values())]
+    )
     top = 1.05 * highest / (0.8 if shapes else 1.0)
     return {
         "data": data,
@@ -534,7 +536,7 @@ def draw_predicted_patches(patches: Sequence[PatchComparison]) -> Figure:
     for channel in dict.fromkeys(patch.channel for patch in patches):
         mine = [patch for patch in patches if patch.channel == channel]
         colour = CHANNEL.get(channel, "#888888")
-        std = [float(np.hypot(one.measured_dn_std, one.predicted_dn_std)) for one in mine]
+        std = [float(np.hypot(patch.measured_dn_std, patch.predicted_dn_std)) for patch in mine]
         data.append(
             {"type": "scatter", "mode": "markers", "name": channel, "text": [patch.patch for patch in mine]}
             | {"x": [patch.measured_dn for patch in mine], "y": [patch.predicted_dn for patch in mine]}
@@ -567,10 +569,10 @@ def patch_comparison(patches: Sequence[PatchComparison], improved: Sequence[Patc
         names = [patch.patch for patch in mine]
         suffix = "" if number == 0 else str(number + 1)
         on = {"type": "scatter", "yaxis": f"y{suffix}", "showlegend": number == 0}
-        std = [unit * float(np.hypot(one.measured_dn_std, one.predicted_dn_std)) for one in mended or mine]
+        std = [unit * float(np.hypot(patch.measured_dn_std, patch.predicted_dn_std)) for patch in mended or mine]
         for name, values, colour, dash, width in (
-            (first, [one.predicted_dn for one in mine], BEFORE, "dash", 1.6),
-            ("improved model", [one.predicted_dn for one in mended], AFTER, "solid", 1.8),
+            (first, [patch.predicted_dn for patch in mine], BEFORE, "dash", 1.6),
+            ("improved model", [patch.predicted_dn for patch in mended], AFTER, "solid", 1.8),
         ):
             if values:
                 line = {"color": colour, "width": width, "dash": dash}
@@ -782,7 +784,7 @@ def held_out_bars(diagnosis: DiagnosisResult) -> Figure | None:
     if held is None or held.n == 0:
         return None
     every = (held.chi2_before, held.chi2_after, held.chi2_discovered)
-    left = [one / held.n for one in every if one is not None]
+    left = [chi2 / held.n for chi2 in every if chi2 is not None]
     return {
         "data": [
             {
@@ -791,7 +793,7 @@ def held_out_bars(diagnosis: DiagnosisResult) -> Figure | None:
                 "y": ["baseline", "improved model", "with laws without a name"][: len(left)],
                 "x": left,
                 "marker": {"color": [BEFORE, AFTER, AFTER][: len(left)]},
-                "text": [f"{one:.2f}" for one in left],
+                "text": [f"{ratio:.2f}" for ratio in left],
                 "textposition": "auto",
                 "showlegend": False,
             }
@@ -846,7 +848,7 @@ class ChartData:
         self._lines.append(figure_json(figure))
         return len(self._lines) - 1
 
-    def packed(self) -> str:
+    def pack(self) -> str:
         """All figures, a line of JSON each, compressed, as base64: no text of theirs can end the element that holds
         it."""
         return base64.b64encode(gzip.compress("\n".join(self._lines).encode(), mtime=0)).decode("ascii")
@@ -871,15 +873,15 @@ def _pack(values: Any) -> dict[str, str] | None:
 def figure_json(figure: Figure) -> str:
     """Return a figure as one line of JSON: a trace's numbers as typed arrays, others rounded to 7 digits."""
 
-    def rounded(value: Any, key: str = "") -> Any:
+    def round_numbers(value: Any, key: str = "") -> Any:
         if key in PACKED and (packed := _pack(value)) is not None:
             return packed
         if isinstance(value, dict):
-            return {name: rounded(item, name) for name, item in value.items()}
+            return {name: round_numbers(item, name) for name, item in value.items()}
         if isinstance(value, list | tuple):
-            return [rounded(item) for item in value]
+            return [round_numbers(item) for item in value]
         if isinstance(value, float):
             return float(f"{value:.7g}") if np.isfinite(value) else None
         return value
 
-    return json.dumps(rounded(figure), separators=(",", ":"), allow_nan=False)
+    return json.dumps(round_numbers(figure), separators=(",", ":"), allow_nan=False)

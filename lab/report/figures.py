@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
-from lab.formats.results.words import measured, plain_name, unit_of
+from lab.formats.results.words import format_value, plain_name, unit_of
 from sim.camera import Side
 from sim.scene.projection import Projection
 
@@ -52,8 +52,8 @@ class KeyFigure:
     @property
     def text(self) -> str:
         """The value and its standard deviation with unit and note: `0.383 ± 0.008 at 610 nm`."""
-        told = f"{measured(self.value, self.std, self.unit)} {self.note}".rstrip()
-        return told if self.is_determined else f"not determined ({told})"
+        text = f"{format_value(self.value, self.std, self.unit)} {self.note}".rstrip()
+        return text if self.is_determined else f"not determined ({text})"
 
 
 def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[KeyFigure]:
@@ -72,10 +72,10 @@ def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[
 
 def mtf50_range(curves: tuple[MtfCurve, ...], channel: str) -> tuple[float, float, int] | None:
     """(lowest, highest, number) of one channel's MTF50 over all edges, cy/px; None where no edge has one."""
-    found = [
+    mtf50 = [
         curve.mtf50_cy_per_px for curve in curves if curve.channel == channel and curve.mtf50_cy_per_px is not None
     ]
-    return (min(found), max(found), len(found)) if found else None
+    return (min(mtf50), max(mtf50), len(mtf50)) if mtf50 else None
 
 
 def camera_figures(fit: CameraFit, camera: DataSheet | None = None) -> Iterator[KeyFigure]:

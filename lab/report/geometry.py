@@ -15,7 +15,7 @@ from lab.errors import InputError, NotDetermined
 from lab.fit.stereo import rectification_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelGeometry, DepthUncertainty, GeometryFit, ProjectionUncertainty, StereoFit
-from lab.formats.results.words import PROJECTION_NAMES, measured
+from lab.formats.results.words import PROJECTION_NAMES, format_value
 from lab.observables.boards.detection import luminance
 from lab.report.charts import CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.pictures import photograph_data_uri
@@ -100,7 +100,7 @@ def lines_of_vectors(at: FloatArray, vector: FloatArray, shape: tuple[float, flo
     a round number."""
     usual = max(float(np.percentile(np.linalg.norm(vector, axis=1), 95)), 1e-9)
     wanted = ARROWS * shape[1] / usual
-    scale = max([one for one in SCALES if one <= wanted], default=SCALES[0])
+    scale = max([factor for factor in SCALES if factor <= wanted], default=SCALES[0])
     ends = at + scale * vector
     lines = np.stack([at, ends, np.full_like(at, np.nan)], axis=1).reshape(-1, 2)
     return [
@@ -149,7 +149,7 @@ def _map(
     if wide:
         decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
         ticks = [m * 10.0**d for d in decades for m in (1, 2, 5) if low <= m * 10.0**d <= high]
-        bar |= {"tickvals": [float(np.log10(one)) for one in ticks], "ticktext": [f"{one:g}" for one in ticks]}
+        bar |= {"tickvals": [float(np.log10(value)) for value in ticks], "ticktext": [f"{value:g}" for value in ticks]}
     return {
         "data": [
             {
@@ -230,18 +230,18 @@ def facts(geometry: GeometryFit) -> list[tuple[str, str]]:
                 f"{parts_px.noise_px:.4f} px (sampling error); {parts_px.model_error_px:.4f} px (model error)",
             )
         )
-    own = geometry.cross_validation
-    if own is not None:
-        error = f"model error {own.model_error_px:.3f} px" if own.model_error_px > 0 else "no model error"
+    halves = geometry.cross_validation
+    if halves is not None:
+        error = f"model error {halves.model_error_px:.3f} px" if halves.model_error_px > 0 else "no model error"
         rows.append(
             (
                 "cross-validation of two halves of the views",
-                f"{own.difference_px:.4f} px difference, {own.expected_px:.4f} px expected: {error}",
+                f"{halves.difference_px:.4f} px difference, {halves.expected_px:.4f} px expected: {error}",
             )
         )
     for warp in geometry.board_warp:
         parts = [
-            f"{name} {measured(value, std, 'mm')}"
+            f"{name} {format_value(value, std, 'mm')}"
             for name, value, std in (
                 ("bend x", warp.bend_x_mm, warp.bend_x_mm_std),
                 ("bend y", warp.bend_y_mm, warp.bend_y_mm_std),
@@ -252,7 +252,7 @@ def facts(geometry: GeometryFit) -> list[tuple[str, str]]:
         rows.append((f"warp of the board ({warp.board})", ", ".join(parts) or "not determined"))
     for channel in geometry.channels:
         if channel.radius_px:
-            shift = measured(channel.radial_shift_px[-1], channel.radial_shift_px_std[-1], "px")
+            shift = format_value(channel.radial_shift_px[-1], channel.radial_shift_px_std[-1], "px")
             at = f"at {channel.radius_px[-1]:.0f} px from the principal point"
             rows.append((f"lateral colour, {channel.channel} − G", f"{shift} {at}"))
     rows += [
@@ -318,21 +318,21 @@ def charts_by_side(fits: Mapping[Side, GeometryFit | None]) -> list[tuple[str, d
         return lambda fit: projection_map(fit.projection[place]) if len(fit.projection) > place else None
 
     known = next((fit.projection for fit in fits.values() if fit is not None and fit.projection), ())
-    found = [
+    rows = [
         ("Coverage by the boards", of(coverage), "Corners of each view in the frame, and their convex hull."),
         ("Reprojection residuals, measured − predicted", of(residual_vectors), ""),
     ]
-    for place, one in enumerate(known):
-        where = "at infinity" if one.distance_mm is None else "at the boards' distance"
+    for place, projection in enumerate(known):
+        where = "at infinity" if projection.distance_mm is None else "at the boards' distance"
         caption = (
             "Standard deviation in the worst direction; the rigid motion that the corners can't separate from the "
             "intrinsics is removed."
         )
-        found.append(
+        rows.append(
             (f"Uncertainty of the projection, {where}", of(at(place)), caption if place == len(known) - 1 else "")
         )
-    found.append(("Lateral colour", of(lambda fit: lateral_colour(fit.channels)), "Bands: two standard deviations."))
-    return found
+    rows.append(("Lateral colour", of(lambda fit: lateral_colour(fit.channels)), "Bands: two standard deviations."))
+    return rows
 
 
 def stereo_context(recordings: RecordingSet, stereo: StereoFit | None) -> dict[str, Any]:

@@ -64,28 +64,28 @@ def parse_changes(text: str) -> Changes:
     used."""
     values: dict[str, str] = {}
     known = ", ".join(Changes.model_fields)
-    for part in filter(None, (one.strip() for one in text.split(","))):
-        key, equals, value = (one.strip() for one in part.partition("="))
+    for part in filter(None, (entry.strip() for entry in text.split(","))):
+        key, equals, value = (piece.strip() for piece in part.partition("="))
         if key not in Changes.model_fields:
             raise InputError(f"--change {part}: {key!r} isn't a change; take some of {known}")
         if not equals or not value or key in values:
             raise InputError(f"--change {part}: give {key}=VALUE, once")
         values[key] = value
-    return checked_changes(values, "--change ")
+    return validate_changes(values, "--change ")
 
 
-def checked_changes(values: Mapping[str, Any], where: str) -> Changes:
+def validate_changes(values: Mapping[str, Any], where: str) -> Changes:
     """Return the changes of these values. Raises InputError, beginning with `where`, for one that can't be used."""
     try:
         return Changes.model_validate(values)
     except ValidationError as error:
-        first = next((one for one in error.errors() if one["type"] == "value_error"), error.errors()[0])
-        told = first["msg"].removeprefix("Value error, ")
+        first = next((detail for detail in error.errors() if detail["type"] == "value_error"), error.errors()[0])
+        reason = first["msg"].removeprefix("Value error, ")
         given = first["input"] if isinstance(first["input"], str | int | float) else "..."
-        raise InputError(f"{where}{first['loc'][0]}={given}: {told}; correct it") from error
+        raise InputError(f"{where}{first['loc'][0]}={given}: {reason}; correct it") from error
 
 
-def carried(content: CameraFile, changes: Changes) -> CameraFile:
+def apply_changes(content: CameraFile, changes: Changes) -> CameraFile:
     """Return the model with the changes to its lens; aberrations say at which f-number they were fitted. Raises
     InputError where it can't carry one of the changes."""
     fitted_f_number = content.camera.lens.f_number

@@ -20,20 +20,20 @@ LINEARITY_RANGE = (0.05, 0.95)  # of saturation: range of the linearity line of 
 
 def linearity_by_plane(e: Evaluation) -> tuple[dict[str, Linearity], dict[tuple[int, str], float]]:
     """Linearity by plane, and the deviation, %, of every (id of level, plane) that has one."""
-    found: dict[str, Linearity] = {}
+    lines: dict[str, Linearity] = {}
     deviation: dict[tuple[int, str], float] = {}
     for name in e.levels.names:
         chosen = levels_in_range(e, name, *LINEARITY_RANGE)
         if len({level.light for level in chosen}) < 4:
             continue
-        found[name] = _line(e, name, chosen)
-        for level, percent in zip(chosen, found[name].deviation_percent, strict=True):
+        lines[name] = _line(e, name, chosen)
+        for level, percent in zip(chosen, lines[name].deviation_percent, strict=True):
             deviation[id(level), name] = float(percent)
-    if not found:
+    if not lines:
         e.remarks.add(
             "fewer than four levels of one lamp between 5 and 95 % of saturation: the linearity error isn't determined"
         )
-    return found, deviation
+    return lines, deviation
 
 
 def linearity_error(e: Evaluation) -> tuple[float | None, float | None]:
@@ -194,24 +194,24 @@ def variance_curvature_figures(e: Evaluation) -> dict[str, float]:
     t = e.transfer
     if not e.reaches_saturation:
         return {}
-    found = {
+    figures = {
         "variance_bend_percent": 100.0 * t.relative_curvature,
         "variance_bend_percent_std": 100.0 * t.relative_curvature_std,
     }
     shared = neighbour_covariance(e)
     if shared is not None:
-        found["neighbour_covariance_percent"] = 100.0 * shared[0]
-        found["neighbour_covariance_percent_std"] = 100.0 * shared[1]
+        figures["neighbour_covariance_percent"] = 100.0 * shared[0]
+        figures["neighbour_covariance_percent_std"] = 100.0 * shared[1]
     response = response_curvature(e)
     if response is None:
-        return found
-    found["response_bend_percent"], found["response_bend_percent_std"] = 100.0 * response[0], 100.0 * response[1]
+        return figures
+    figures["response_bend_percent"], figures["response_bend_percent_std"] = 100.0 * response[0], 100.0 * response[1]
     # v = K (dy/de)^2 e: a response of curvature b at saturation gives the variance a curvature of 3 b
     missing = 3.0 * response[0] - t.relative_curvature
     missing_std = float(np.hypot(3.0 * response[1], t.relative_curvature_std))
     if missing_std > LARGEST_BEND_STD:
-        return found
-    found["brighter_fatter_percent"], found["brighter_fatter_percent_std"] = 100.0 * missing, 100.0 * missing_std
+        return figures
+    figures["brighter_fatter_percent"], figures["brighter_fatter_percent_std"] = 100.0 * missing, 100.0 * missing_std
     causes = []
     if abs(response[0]) > 4.0 * response[1] and abs(3.0 * response[0]) > 2.0 * missing_std:
         causes.append(f"a response that bends by {100 * response[0]:+.2g} +- {100 * response[1]:.1g} %")
@@ -226,7 +226,7 @@ def variance_curvature_figures(e: Evaluation) -> dict[str, float]:
         )
     if causes and abs(t.relative_curvature) > 2.0 * t.relative_curvature_std:
         e.remarks.add(f"at saturation, the variance bends by {' and '.join(causes)}")
-    return found
+    return figures
 
 
 def response_curvature(e: Evaluation) -> tuple[float, float] | None:
@@ -303,10 +303,10 @@ def neighbour_covariance(e: Evaluation) -> tuple[float, float] | None:
     rows: list[tuple[float, float, float]] = []
     dark: dict[str, tuple[float, float]] = {}
     for name in e.levels.names:
-        own = [level.plane[name] for level in e.levels.darks if np.isfinite(level.plane[name].covariance_std)]
-        if own:
-            weight = np.array([1.0 / max(plane.covariance_std, 1e-9) ** 2 for plane in own])
-            both = np.array([4.0 * (plane.adjacent_covariance + plane.diagonal_covariance) for plane in own])
+        dark_planes = [level.plane[name] for level in e.levels.darks if np.isfinite(level.plane[name].covariance_std)]
+        if dark_planes:
+            weight = np.array([1.0 / max(plane.covariance_std, 1e-9) ** 2 for plane in dark_planes])
+            both = np.array([4.0 * (plane.adjacent_covariance + plane.diagonal_covariance) for plane in dark_planes])
             dark[name] = float(np.average(both, weights=weight)), float(np.sqrt(32.0 / weight.sum()))
     for level, name in e.points:
         plane = level.plane[name]

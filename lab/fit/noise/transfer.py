@@ -241,9 +241,11 @@ class TransferPoints:
         """
         values, stds, signals = [], [], []
         for index in range(int(self.plane.max()) + 1):
-            own = ~self.light & (self.plane == index)
-            weight = 1.0 / (np.hypot(self.relative[own], error) * self.variance[own]) ** 2
-            values.append(float(np.average(self.variance[own] - gain * self.signal[own], weights=weight)))
-            signals.append(float(np.average(self.signal[own], weights=weight)))
+            darks_of_plane = ~self.light & (self.plane == index)
+            weight = 1.0 / (np.hypot(self.relative[darks_of_plane], error) * self.variance[darks_of_plane]) ** 2
+            values.append(
+                float(np.average(self.variance[darks_of_plane] - gain * self.signal[darks_of_plane], weights=weight))
+            )
+            signals.append(float(np.average(self.signal[darks_of_plane], weights=weight)))
             stds.append(float(weight.sum() ** -0.5))
         return np.array(values), np.array(stds), np.array(signals)

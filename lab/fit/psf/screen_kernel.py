@@ -147,13 +147,13 @@ class DrawnPattern:
         pixels.
         """
         across = [np.linspace(v.min(), v.max() + 1, count + 1) for v in (self.row, self.col)]
-        found = []
+        parts = []
         for top, bottom in zip(across[0][:-1], across[0][1:], strict=True):
             for left, right in zip(across[1][:-1], across[1][1:], strict=True):
                 chosen = (self.row >= top) & (self.row < bottom) & (self.col >= left) & (self.col < right)
                 if np.count_nonzero(chosen) >= 2 * self.support**2:
-                    found.append(self.within(chosen))
-        return found
+                    parts.append(self.within(chosen))
+        return parts
 
     def within(self, chosen: NDArray[np.bool_]) -> DrawnPattern:
         """Return the pattern with the pixels `chosen`, (n,), alone."""
@@ -233,8 +233,8 @@ class ScreenKernel:
         size = fine.kernel.size
         data = fine.information[:, :size] @ (np.asarray(fine_kernel, dtype=float).ravel() * (1.0 - self.outside))
         data = data + fine.information[:, size] * self.outside
-        found = on_simplex(fine.information + fine.precision, data, np.append(fine.kernel.ravel(), self.outside))
-        return on_pixels(found[:size].reshape(fine.kernel.shape), self.oversample)
+        solution = on_simplex(fine.information + fine.precision, data, np.append(fine.kernel.ravel(), self.outside))
+        return on_pixels(solution[:size].reshape(fine.kernel.shape), self.oversample)
 
 
 @dataclass(frozen=True)
@@ -269,7 +269,7 @@ def measure_field(
         raise ValueError(f"oversample = {oversample} must be 2 or 4 samples a pixel")
     places, step = phases(cfa), period(cfa)
     reference = "Y" if cfa == "MONO" else "G"
-    found: dict[str, ScreenKernel] = {}
+    kernel_of_channel: dict[str, ScreenKernel] = {}
     local: list[ScreenKernel] = []
     size = support_px
 
@@ -286,13 +286,13 @@ def measure_field(
         if channel != reference:
             drawn = draw_for(channel, drawn.refine_warp(estimate))
         whole = solve_kernel(drawn.normal(), drawn.support, outside=True)
-        found[channel] = screen_kernel(drawn, channel, whole)
+        kernel_of_channel[channel] = screen_kernel(drawn, channel, whole)
         if channel == reference and patches > 1:
             local = [
                 screen_kernel(part, channel, solve_kernel(part.normal(), part.support, outside=True, prior_of=whole))
                 for part in drawn.parts(patches)
             ]
-    return ScreenField({channel: found[channel] for channel in places}, tuple(local))
+    return ScreenField({channel: kernel_of_channel[channel] for channel in places}, tuple(local))
 
 
 def _rim_share(kernel: Array, oversample: int) -> float:
@@ -355,13 +355,13 @@ def expected_kernel(
     power = np.square(np.sinc(cell_px * fy))[:, None] * np.square(np.sinc(cell_px * fx))
     drawn = drawn_y[:, None] * drawn_x
     every = fine // oversample
-    own = np.fft.irfft2(power * drawn**2, (count, count))[::every, ::every]
+    autocorrelation = np.fft.irfft2(power * drawn**2, (count, count))[::every, ::every]
     cross = np.fft.irfft2(power * drawn * transfer(fx[None, :], fy[:, None]), (count, count))[::every, ::every]
     place = np.arange(support) - support // 2
     lag = place[:, None] - place
-    matrix = own[lag[:, None, :, None], lag[None, :, None, :]].reshape(support**2, support**2)
+    matrix = autocorrelation[lag[:, None, :, None], lag[None, :, None, :]].reshape(support**2, support**2)
     # A small ridge where the pattern has no power; the sum is known far better, from the mean of the pattern
-    matrix = matrix + 1e-4 * own[0, 0] * np.eye(support**2)
-    mean = 1e3 * own[0, 0]
+    matrix = matrix + 1e-4 * autocorrelation[0, 0] * np.eye(support**2)
+    mean = 1e3 * autocorrelation[0, 0]
     kernel = np.linalg.solve(matrix + mean, cross[place[:, None], place].ravel() + mean)
     return on_pixels(kernel.reshape(support, support), oversample)

@@ -175,10 +175,10 @@ def least_misfit(covariance: FloatArray, line: FloatArray, value: FloatArray, st
     start = -np.log(max(float(eigenvalue.max()), 1e-300))
     grid = start + np.linspace(-2.0, 40.0, 85)
     best = int(np.argmin([loss(g) for g in grid]))
-    found = optimize.minimize_scalar(
+    minimum = optimize.minimize_scalar(
         loss, bounds=(grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]), method="bounded"
     )
-    return float(found.fun), float(np.exp(0.5 * found.x))
+    return float(minimum.fun), float(np.exp(0.5 * minimum.x))
 
 
 @dataclass(frozen=True, eq=False)

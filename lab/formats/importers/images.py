@@ -113,7 +113,7 @@ class ImageFiles(FolderFiles):
         return str(self.images[path]) if path in self.images else super().where(path)
 
 
-def described_sides(file: Path) -> dict[Side, dict[str, Any]]:
+def read_sides(file: Path) -> dict[Side, dict[str, Any]]:
     """Return what `camera.toml` says of each side: its keys at the top are of a single (left) camera, or of every side
     where it has the tables `[left]` and `[right]`. A missing file says nothing of the left one."""
     written: dict[str, Any] = {}
@@ -137,7 +137,7 @@ def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> 
     """Return the cameras that `camera.toml` describes, by the keys of a recording set's camera. Keys that it leaves out
     come from that side's `defaults`; a missing file is an empty one."""
     cameras = {}
-    for side, keys in described_sides(file).items():
+    for side, keys in read_sides(file).items():
         known = {key: value for key, value in keys.items() if key != "taps"}  # of the readout, not of the data sheet
         try:
             cameras[side] = DataSheet.model_validate({**defaults.get(side, {}), **known})
@@ -199,7 +199,7 @@ class Readout:
         """Rows and columns of the frames that come out."""
         return len(self.rows), len(self.cols)
 
-    def applied(self, frame: Frame) -> Frame:
+    def apply(self, frame: Frame) -> Frame:
         """Return a frame as it is stored, cropped, joined, and with its taps at one black level; codes don't fall
         below 0."""
         made = np.zeros(frame.shape, np.int64)
@@ -225,7 +225,7 @@ class TapFiles(ImageFiles):
 
     def frame(self, path: str, camera: DataSheet) -> Frame:
         frame = super().frame(path, camera)
-        return self.readouts[path].applied(frame) if path in self.readouts else frame
+        return self.readouts[path].apply(frame) if path in self.readouts else frame
 
 
 def parse_taps(listed: Any, where: str) -> tuple[Tap, ...]:
@@ -247,7 +247,7 @@ def readout(taps: Sequence[Tap], files: Sequence[Path], shape: tuple[int, int], 
     the frame, the regions don't tile a rectangle, or a black level isn't known."""
     for tap in taps:
         _check_inside(tap, shape, where)
-    kept_rows, kept_cols, cut = _tiled(taps, shape, where)
+    kept_rows, kept_cols, cut = _tile_regions(taps, shape, where)
     unknown = [tap.name for tap in taps if tap.overscan is None and tap.black_level_dn is None]
     if unknown:
         raise InputError(
@@ -297,7 +297,7 @@ def _check_inside(tap: Tap, shape: tuple[int, int], where: str) -> None:
             )
 
 
-def _tiled(
+def _tile_regions(
     taps: Sequence[Tap], shape: tuple[int, int], where: str
 ) -> tuple[tuple[int, ...], tuple[int, ...], list[str]]:
     """Return the rows and the columns that the regions tile, and the runs between them that are cut out, in words."""

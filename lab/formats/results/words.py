@@ -105,10 +105,10 @@ def plain_name(figure: str, place: str = "") -> str:
     field, of = _parts(figure)
     if not field:
         return " ".join(part for part in (figure.replace("_", " "), place) if part)
-    one = PLACES.get((field, place))
-    if one is None:
-        one = f"{NAMES[field]} {place}".rstrip()
-    return ", ".join(part for part in (one, " ".join(of)) if part)
+    text = PLACES.get((field, place))
+    if text is None:
+        text = f"{NAMES[field]} {place}".rstrip()
+    return ", ".join(part for part in (text, " ".join(of)) if part)
 
 
 def unit_of(figure: str) -> str:
@@ -125,7 +125,7 @@ MOST_DECIMALS = 9
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def shown_unit(unit: str) -> str:
+def format_unit(unit: str) -> str:
     """Return a unit as it is printed; empty for a ratio."""
     return SHOWN_UNITS.get(unit, unit)
 
@@ -144,7 +144,7 @@ def plain_number(value: float, digits: int) -> str:
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
-def measured(
+def format_value(
     value: float, std: float | None = None, unit: str = "", interval: tuple[float, float] | None = None
 ) -> str:
     """Return `value ± std unit`, the standard deviation to two digits and the value to the same place.
@@ -153,7 +153,7 @@ def measured(
     """
     if interval is not None:
         low, high = (plain_number(end, 3) for end in interval)
-        return f"{plain_number(value, 3)} ({low} to {high}) {shown_unit(unit)}".rstrip()
+        return f"{plain_number(value, 3)} ({low} to {high}) {format_unit(unit)}".rstrip()
     if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
         number = plain_number(value, 4)
     else:
@@ -165,7 +165,7 @@ def measured(
             power = math.floor(math.log10(max(abs(value), std)))
             decimals = max(place + power, 0)
             number = f"({value / 10.0**power:.{decimals}f} ± {std / 10.0**power:.{decimals}f}){_ten_to(power)}"
-    return f"{number} {shown_unit(unit)}".rstrip()
+    return f"{number} {format_unit(unit)}".rstrip()
 
 
 def _to_place(value: float, place: int) -> float:
