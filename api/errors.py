@@ -74,8 +74,12 @@ _MEANINGS = {
 
 
 def answers(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's error responses of a route. They are problem details whatever the route returns, so FastAPI's `model`
-    doesn't fit."""
+    """Return OpenAPI's error responses of a route. They are problem details whatever the route returns, so that FastAPI's
+    `model` doesn't fit.
+
+    >>> list(answers(404, 422))
+    [404, 422]
+    """
     content = {MEDIA_TYPE: {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}}
     return {status: {"description": _MEANINGS[status], "content": content} for status in statuses}
 

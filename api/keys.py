@@ -52,7 +52,11 @@ def new_key() -> str:
 
 
 def digest(key: str) -> str:
-    """Return what is stored of a key."""
+    """Return what is stored of a key: its SHA-256.
+
+    >>> len(digest("a key"))
+    64
+    """
     return hashlib.sha256(key.encode()).hexdigest()
 
 
@@ -151,7 +155,11 @@ class HideKeys(logging.Filter):
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address is this computer's own."""
+    """Return whether an address is this computer's own.
+
+    >>> is_loopback("127.0.0.1"), is_loopback("192.0.2.1")
+    (True, False)
+    """
     if host == "localhost":
         return True
     try:

@@ -54,8 +54,13 @@ def check_room(folder: Path, wanted_bytes: int) -> None:
 
 
 def inside(name: str) -> PurePosixPath:
-    """Return a member's name as a path in the folder. Raises InputError for a path that leads out of it, and for a name
-    that some system couldn't keep."""
+    """Return a member's name as a path in the folder.
+
+    Raises InputError for a path that leads out of it, and for a name that some system couldn't keep.
+
+    >>> inside("frames/dark-1.npy")
+    PurePosixPath('frames/dark-1.npy')
+    """
     path = PurePosixPath(name)
     parts = path.parts
     causes = {

@@ -42,7 +42,10 @@ def is_recordings(source: str) -> bool:
 
 
 def check_size(size_bytes: int, limit_bytes: int) -> None:
-    """Raises TooMuch for an archive, stated or received, beyond the limit."""
+    """Check the size of an archive, stated or received. Raises TooMuch beyond the limit.
+
+    >>> check_size(100, 1000)
+    """
     if size_bytes > limit_bytes:
         raise TooMuch(f"the archive is larger than {limit_bytes} bytes; send less at a time")
 

@@ -173,12 +173,23 @@ class Pipe:
 
 
 def timeout_error() -> usb.core.USBTimeoutError:
-    """Return the exception that pyusb's own backends raise on a time-out."""
+    """Return the exception that pyusb's own backends raise on a time-out.
+
+    >>> timeout_error().errno == errno.ETIMEDOUT
+    True
+    """
     return usb.core.USBTimeoutError("Operation timed out", error_code=-7, errno=errno.ETIMEDOUT)
 
 
 def usb_error(status: int, what: str) -> usb.core.USBError:
-    """Return a USB error of an errno (positive)."""
+    """Return a USB error.
+
+    status : errno, positive
+    what : beginning of the message
+
+    >>> str(usb_error(errno.ENODEV, "the camera"))
+    '[Errno 19] the camera: ENODEV'
+    """
     return usb.core.USBError(f"{what}: {errno.errorcode.get(status, status)}", errno=status)
 
 

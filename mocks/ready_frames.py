@@ -38,7 +38,14 @@ def pack_12p(raw: UInt16Array) -> bytes:
 
 
 def payload_bytes(pixel_format: int, pixels: int) -> int:
-    """Size of a frame's payload."""
+    """Return the size of a frame's payload, bytes.
+
+    pixel_format : PFNC code of GenICam, with the bits of a pixel in its second byte from the left
+    pixels : of the frame
+
+    >>> payload_bytes(0x010C0047, 100)  # BayerRG12p
+    150
+    """
     return (pixels * ((pixel_format >> 16) & 0xFF) + 7) // 8
 
 

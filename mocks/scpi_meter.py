@@ -19,7 +19,13 @@ _RANGE_A = 0.02
 
 
 def responsivity_a_per_w(wavelength_nm: FloatArray) -> FloatArray:
-    """Return a silicon photodiode's: a quantum efficiency that falls off towards 300 nm and 1100 nm."""
+    """Return the responsivity (A/W) of a silicon photodiode, whose quantum efficiency falls off towards 300 nm and 1100 nm.
+
+    wavelength_nm : (m,)
+
+    >>> responsivity_a_per_w(np.array([700.0])).round(2).tolist()
+    [0.48]
+    """
     efficiency = 0.85 / (1.0 + np.exp((wavelength_nm - 1050.0) / 25.0)) / (1.0 + np.exp((330.0 - wavelength_nm) / 20.0))
     return np.asarray(efficiency * wavelength_nm / 1239.84)
 

@@ -34,12 +34,22 @@ _LENGTHS = {0x01: 1, 0x02: 5, 0x03: 3, 0x05: 2, 0x09: 1, 0x0A: 3, 0x6A: 4, 0x6B:
 
 
 def wavelength_nm() -> NDArray[np.float64]:
-    """Wavelength of every pixel, (2048,)."""
+    """Return the wavelength of every pixel, (2048,), nm.
+
+    >>> wavelength_nm().shape
+    (2048,)
+    """
     return np.asarray(np.polynomial.polynomial.polyval(np.arange(PIXELS), WAVELENGTH_NM), float)
 
 
 def response(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Counts a second for a radiance of 1 W sr^-1 m^-2 nm^-1: grating and silicon."""
+    """Return the counts a second for a radiance of 1 W sr^-1 m^-2 nm^-1: grating and silicon.
+
+    wavelength : (m,), nm
+
+    >>> bool(response(np.array([540.0]))[0] > response(np.array([900.0]))[0])
+    True
+    """
     blaze = np.exp(-0.5 * ((wavelength - 540.0) / 170.0) ** 2)
     return 4.0e7 * (blaze + 0.03) * (1.0 + 0.02 * np.sin(wavelength / 23.0))
 

@@ -162,10 +162,15 @@ class FaultPlan:
 
 
 def parse_faults(spec: str, frames: bool = False) -> tuple[Fault, ...]:
-    """Faults from `KIND[=VALUE][@N[+]]`, several with commas: `half@3`, `late=5@2`, `error=120@1+`. `frames`: those of
-    a camera, too.
+    """Return the faults of a mock's option `--fault`.
+
+    spec : `KIND[=VALUE][@N[+]]`, several with commas: `half@3`, `late=5@2`, `error=120@1+`
+    frames : those of a camera, too
 
     Raises `FaultSpecError`.
+
+    >>> parse_faults("late=5@2")[0].value
+    5.0
     """
     kinds = KINDS + FRAME_KINDS if frames else KINDS
     faults: list[Fault] = []

@@ -26,7 +26,10 @@ class NotMet(Exception):
 
 
 def require(holds: bool, otherwise: str) -> None:
-    """Raise `NotMet` with `otherwise` unless something holds."""
+    """Raise `NotMet` with `otherwise` unless something holds.
+
+    >>> require(holds=True, otherwise="the shutter stays open")
+    """
     if not holds:
         raise NotMet(otherwise)
 

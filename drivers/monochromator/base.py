@@ -39,10 +39,14 @@ ORDER_SORTING_FILTERS = (
 
 
 def order_sorting_filters(table: Sequence[object] | None) -> tuple[OrderSortingFilter, ...]:
-    """Return the filter table of a station file (rows of `place`, `from_nm`, `to_nm`), checked; None: the default
-    table.
+    """Return the filter table of a station file, checked; the default table where there is none.
+
+    table : rows of `place`, `from_nm`, `to_nm`
 
     Raises `InstrumentError` for a row that lacks a key, an empty or overlapping band.
+
+    >>> [row.place for row in order_sorting_filters([{"place": 1, "from_nm": 300, "to_nm": 600}])]
+    [1]
     """
     if table is None:
         return ORDER_SORTING_FILTERS

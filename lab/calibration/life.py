@@ -165,7 +165,11 @@ def cameras_of(instruments: Snapshots, station: Station) -> dict[Side, str]:
 
 
 def rig_of(cameras: Mapping[Side, str]) -> str:
-    """Return the rig of these cameras: a calibration of it supersedes an earlier one of the same."""
+    """Return the rig of cameras by side: a calibration of it supersedes an earlier one of the same.
+
+    >>> rig_of({"right": "cam-2", "left": "cam-1"})
+    '{"left": "cam-1", "right": "cam-2"}'
+    """
     return json.dumps(dict(sorted(cameras.items())))
 
 

@@ -124,7 +124,12 @@ class Limit(Frozen):
         return f"<= {high:g}" if low is None else f">= {low:g}" if high is None else f"{low:g} .. {high:g}"
 
     def judge(self, figure: Figure) -> Mark:
-        """In which band the figure lies, with its uncertainty."""
+        """Return in which band the figure lies, the whole interval of two standard deviations on each side (ISO 14253-1).
+
+        >>> limit = Limit(figure="noise read_noise_e", good=(None, 3.0), warn=(None, 4.0))
+        >>> limit.judge(Figure(name="noise read_noise_e", side="left", place="", value=2.9, std=0.1))
+        'warn'
+        """
         half = COVERAGE_FACTOR * figure.std
         for mark, band in (("good", self.good), ("warn", self.warn or self.good)):
             low, high = _ends(band)
@@ -175,7 +180,18 @@ class Judgement(Frozen):
 
 
 def judge_figures(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judgement, ...]:
-    """Every figure that a limit concerns, in the order of the limits."""
+    """Judge every figure that a limit concerns, in the order of the limits.
+
+    figures : of a calibration, as `figures_of` lists them
+    limits : of the laboratory
+
+    Returns a judgement for each pair of limit and figure. A limit that concerns no figure has one of its own, `missing`.
+
+    >>> limits = CalibrationLimits(limit=(Limit(figure="noise read_noise_e", good=(None, 3.0)),))
+    >>> figure = Figure(name="noise read_noise_e", side="left", place="", value=2.0, std=0.1)
+    >>> [judgement.mark for judgement in judge_figures((figure,), limits)]
+    ['good']
+    """
     judgements: list[Judgement] = []
     for limit in limits.limit:
         concerned = [figure for figure in figures if limit.concerns(figure)]

@@ -39,7 +39,11 @@ class SessionOverview(Frozen):
 
 
 def tags_of(notes: str) -> tuple[str, ...]:
-    """Return the tags of a session: the words of its notes that begin with #, each once."""
+    """Return the tags of a session: the words of its notes that begin with #, each once, without it.
+
+    >>> tags_of("new lens #wide, again #wide #cold")
+    ('wide', 'cold')
+    """
     return tuple(dict.fromkeys(_TAG.findall(notes)))
 
 

@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 
 
 def npy_bytes(array: NDArray[Any]) -> bytes:
-    """Return an array as the bytes of its .npy file."""
+    """Return an array as the bytes of its .npy file.
+
+    >>> npy_bytes(np.zeros((2, 2), np.uint16))[1:6]
+    b'NUMPY'
+    """
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()

@@ -429,7 +429,10 @@ MOST_STEPS = 50_000
 
 
 def check_number(steps: float) -> None:
-    """Raises ValueError for more steps than a sequence may have."""
+    """Check how many steps a sequence has. Raises ValueError for more than `MOST_STEPS`.
+
+    >>> check_number(100)
+    """
     if steps > MOST_STEPS:
         raise ValueError(f"{steps:g} steps are more than the limit of {MOST_STEPS}; give fewer frames, or fewer places")
 
@@ -438,22 +441,38 @@ SEQUENCES: dict[str, type[Sequence]] = {}
 
 
 def name_of(step_id: str) -> str:
-    """Return a step's id as the stem of a file name."""
+    """Return a step's id as the stem of a file name.
+
+    >>> name_of("dark/0.1s/1")
+    'dark-0.1s-1'
+    """
     return step_id.replace("/", "-")
 
 
 def frame_path(step_id: str, side: str) -> str:
-    """Path in the session of a step's frame of one side."""
+    """Return the path in the session of a step's frame of one side.
+
+    >>> frame_path("dark/0.1s/1", "left")
+    'frames/dark-0.1s-1-left.npy'
+    """
     return f"frames/{name_of(step_id)}-{side}.npy"
 
 
 def spectrum_path(step_id: str) -> str:
-    """Path in the session of the spectrum that a step measures."""
+    """Return the path in the session of the spectrum that a step measures.
+
+    >>> spectrum_path("narrowband/550")
+    'spectra/narrowband-550.csv'
+    """
     return f"spectra/{name_of(step_id)}.csv"
 
 
 def planned_keys(step_id: str, side: Side) -> dict[str, Any]:
-    """Return the keys that every capture of a step has before it is taken."""
+    """Return the keys that every capture of a step has before it is taken.
+
+    >>> planned_keys("dark/0.1s/1", "left")["id"]
+    'dark-0.1s-1-left'
+    """
     return {"id": f"{name_of(step_id)}-{side}", "side": side, "frame": frame_path(step_id, side), "exposure_s": 0.0}
 
 

@@ -185,12 +185,26 @@ def _without_temperature(a: CameraFit, b: CameraFit, side: Side) -> Iterator[Ski
 
 
 def sigma_of_probability(p_value: float) -> float:
-    """Express a probability as standard deviations of a normal distribution, two-sided."""
+    """Express a probability as standard deviations of a normal distribution, two-sided.
+
+    p_value : probability, 0..1
+
+    >>> round(sigma_of_probability(0.0027), 2)
+    3.0
+    """
     return -float(special.ndtri(max(p_value, 1e-300) / 2.0))
 
 
 def sidak_part(rate: float, number: int) -> float:
-    """Return the probability allowed for each of `number` tests, so that any of them has `rate` (Sidak)."""
+    """Return the probability allowed for each of `number` independent tests, so that any of them has `rate` (Sidak).
+
+    rate : probability that one or more of the tests fail by chance, 0..1
+    number : how many tests
+
+    >>> each = sidak_part(0.01, 200)
+    >>> round(1.0 - (1.0 - each) ** 200, 6)
+    0.01
+    """
     return float(-np.expm1(np.log1p(-rate) / max(number, 1)))
 
 

@@ -124,10 +124,15 @@ def read_foreign_csv(file: Path) -> ForeignText:
 
 
 def plain_csv(text: str) -> tuple[str, tuple[str, ...]]:
-    """Return a table with semicolons or tabs as one with commas; decimal commas become points. What has commas in its
-    first line stays as it is.
+    r"""Bring a table with semicolons or tabs to commas between cells and decimal points.
 
-    Raises InputError where numbers of both kinds stand in it, or where a comma may separate decimals or thousands.
+    text : the table; what has commas in its first line stays as it is
+
+    Returns the table and remarks on what was changed. Raises InputError where numbers of both kinds stand in it, or where
+    a comma may separate decimals or thousands.
+
+    >>> plain_csv("wavelength_nm;value\n400;0,5\n")
+    ('wavelength_nm,value\n400,0.5\n', ('read with semicolons between cells and decimal commas',))
     """
     lines = text.splitlines()
     head = next((line for line in lines if line.strip()), "")
@@ -149,9 +154,14 @@ def plain_csv(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def has_decimal_commas(words: Sequence[tuple[int, str]]) -> bool:
-    """Return whether the numbers among the words of a table, each with its row, have decimal commas.
+    """Return whether the numbers of a table have decimal commas.
+
+    words : (row, word) of each word of the table
 
     Raises InputError where numbers of both kinds stand in it, or where a comma may separate decimals or thousands.
+
+    >>> has_decimal_commas([(2, "400"), (2, "0,5")])
+    True
     """
     commas = [word for word in words if COMMA_NUMBER.fullmatch(word[1])]
     points = [word for word in words if POINT_NUMBER.fullmatch(word[1])]
@@ -176,8 +186,14 @@ def _with_points(cell: str) -> str:
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str | None:
-    """Return the known name that `name` is probably meant to be: the same with another unit, its beginning, or a
-    misspelling of it. None: there is none.
+    """Return the known name that `name` is probably meant to be: the same with another unit, its beginning, or a misspelling
+    of it; None where there is none.
+
+    name : as somebody wrote it
+    known : names that there are
+
+    >>> nearest_name("exposure_ms", ["frame", "exposure_s"])
+    'exposure_s'
     """
     names = list(known)
     asked = re.sub(r"[^a-z0-9.]+", "_", name.lower()).strip("_")
@@ -193,7 +209,11 @@ def nearest_name(name: str, known: Iterable[str]) -> str | None:
 
 
 def in_its_unit(name: str) -> str:
-    """Return a name with the unit of its ending in words: `exposure_s, in seconds`."""
+    """Return a name with the unit of its ending in words.
+
+    >>> in_its_unit("exposure_s")
+    'exposure_s, in seconds'
+    """
     unit = next((words for ending, words in UNITS.items() if name.endswith(f"_{ending}")), None)
     return f"{name}, in {unit}" if unit else name
 
@@ -290,7 +310,11 @@ class CgatsSpectra:
 
 
 def get_quantity(name: str) -> Quantity:
-    """Return the quantity of that name. Raises InputError for another."""
+    """Return the quantity of a name, as a type checker knows it. Raises InputError for another.
+
+    >>> get_quantity("radiance")
+    'radiance'
+    """
     for known in _WRITTEN:
         if name == known:
             return known
@@ -311,10 +335,24 @@ def read_cgats(file: Path) -> CgatsSpectra:
 
 
 def parse_cgats(text: str) -> CgatsSpectra:
-    """Return the spectra in CGATS text. Its InputError leaves the path to the caller.
+    """Return the spectra in CGATS text.
 
     A spectrum has its SAMPLE_NAME where these differ, else its SAMPLE_ID, or both; of several tables, the table's
-    condition or number before it where the names don't differ.
+    condition or number before it where the names don't differ. Raises InputError without the path, which the caller knows.
+
+    >>> text = '''CGATS.17
+    ... SPECTRAL_BANDS "2"
+    ... SPECTRAL_START_NM "400"
+    ... SPECTRAL_END_NM "500"
+    ... BEGIN_DATA_FORMAT
+    ... SAMPLE_ID SPEC_400 SPEC_500
+    ... END_DATA_FORMAT
+    ... BEGIN_DATA
+    ... white 0.25 0.5
+    ... END_DATA
+    ... '''
+    >>> parse_cgats(text).spectra["white"].value
+    (0.25, 0.5)
     """
     tables = _tables(text)
     remarks: list[str] = []

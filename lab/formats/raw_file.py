@@ -241,7 +241,11 @@ def _product(*curves: Spectrum) -> float:
 
 @cache
 def daylight() -> Spectrum:
-    """CIE D65 at 100 cd/m^2 of a white diffuser."""
+    """Return CIE D65 at 100 cd/m^2 of a white diffuser, W sr^-1 m^-2 nm^-1.
+
+    >>> daylight().wavelength_nm[0] < 400.0 < daylight().wavelength_nm[-1]
+    True
+    """
     return illuminant("D65", 100.0)
 
 

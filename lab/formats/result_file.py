@@ -58,7 +58,11 @@ class Provenance(Frozen):
 
 
 def installed_versions() -> dict[str, str]:
-    """Versions of calibench, of the libraries that compute, and of Python."""
+    """Return the versions of calibench, of the libraries that compute, and of Python, by name.
+
+    >>> sorted(set(installed_versions()) & {"calibench", "numpy", "python"})
+    ['calibench', 'numpy', 'python']
+    """
     versions = {"python": platform.python_version(), "system": platform.platform(terse=True)}
     for name in DISTRIBUTIONS:
         try:

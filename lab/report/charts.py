@@ -56,7 +56,11 @@ def _fade(colour: str, opacity: float = FADED) -> str:
 
 
 def axis(title: str, **more: Any) -> dict[str, Any]:
-    """Return a labelled axis in the report's style."""
+    """Return a labelled axis in the report's style; `more`: further keys of Plotly's axis.
+
+    >>> axis("signal, DN", rangemode="tozero")["title"]["text"]
+    'signal, DN'
+    """
     return {
         "title": {"text": title, "standoff": 6},
         "gridcolor": "@grid",
@@ -71,8 +75,13 @@ def axis(title: str, **more: Any) -> dict[str, Any]:
 
 
 def log_axis(title: str, values: Iterable[float], **more: Any) -> dict[str, Any]:
-    """Return a logarithmic axis that holds `values`, with whole numbers at its ticks: 1, 2, 5, 10, 20, ... within
-    `FEW_DECADES`, powers of ten beyond. Values of 0 or below have no place on it."""
+    """Return a logarithmic axis that holds `values`; those of 0 or below have no place on it.
+
+    Its ticks are whole numbers: 1, 2, 5, 10, 20, ... within `FEW_DECADES`, powers of ten beyond.
+
+    >>> log_axis("exposure, s", [0.01, 0.1])["ticktext"]
+    ['0.01', '0.02', '0.05', '0.1']
+    """
     exponents = [math.log10(value) for value in values if value is not None and 0.0 < value < math.inf]
     low, high = (min(exponents), max(exponents)) if exponents else (0.0, 1.0)
     margin = max(LOG_MARGIN * (high - low), 0.05)
@@ -91,7 +100,14 @@ def log_axis(title: str, values: Iterable[float], **more: Any) -> dict[str, Any]
 
 
 def layout(height: int, **more: Any) -> dict[str, Any]:
-    """Return a figure's layout in the report's style."""
+    """Return a figure's layout in the report's style.
+
+    height : px
+    more : further keys of Plotly's layout
+
+    >>> layout(300)["height"]
+    300
+    """
     return {
         "height": height,
         "margin": {"l": 56, "r": 14, "t": 26, "b": 44},
@@ -104,13 +120,28 @@ def layout(height: int, **more: Any) -> dict[str, Any]:
 
 
 def error_bars(std: Sequence[float | None], colour: str) -> dict[str, Any]:
+    """Return error bars of one standard deviation to each side, in a colour.
+
+    std : one for each point; None: none
+
+    >>> error_bars([0.5, None], "#d1495b")["array"]
+    [0.5, None]
+    """
     return {"type": "data", "array": list(std), "color": colour, "thickness": 1, "width": 2}
 
 
 def band(
     x: Sequence[float], centre: np.ndarray[Any, Any], half: np.ndarray[Any, Any], colour: str, **more: Any
 ) -> Trace:
-    """Return a filled band centre +- half."""
+    """Return a filled band centre +- half.
+
+    x : (n,)
+    centre, half : (n,), in one unit
+    more : further keys of the trace
+
+    >>> band([1.0, 2.0], np.array([5.0, 6.0]), np.array([0.5, 0.5]), "#d1495b")["y"]
+    [5.5, 6.5, 5.5, 4.5]
+    """
     return {
         "type": "scatter",
         "x": [*x, *reversed(list(x))],
@@ -677,7 +708,14 @@ def _residual_traces(name: str, x: Sequence[float], residual: np.ndarray[Any, An
 
 
 def beyond_axis(name: str, residual: np.ndarray[Any, Any]) -> str:
-    """Return how many residuals lie beyond the axis, and the farthest; empty where none does."""
+    """Return how many residuals lie beyond the axis, and the farthest; empty where none does.
+
+    name : of the measurement
+    residual : (n,), standard deviations
+
+    >>> beyond_axis("MTF", np.array([0.5, -1.0]))
+    ''
+    """
     beyond = np.abs(residual) > RESIDUAL_SIGMA
     if not beyond.any():
         return ""

@@ -156,7 +156,11 @@ def _cell_map(law: DiscoveredLaw) -> Figure:
 
 
 def mood(chi2: float, n: int) -> str:
-    """CSS class of a chi2's cell: marked above the 99.9 % quantile."""
+    """Return the CSS class of a chi2's cell: marked above the 99.9 % quantile of chi2 with n degrees of freedom.
+
+    >>> mood(200.0, 100), mood(100.0, 100)
+    ('open', '')
+    """
     return "open" if n and chi2 > special.chdtri(n, 1.0 - MARKED_QUANTILE) else ""
 
 

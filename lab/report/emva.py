@@ -39,7 +39,11 @@ class EmvaPlot:
 
 
 def markers(name: str, x: Sequence[float], y: Sequence[float], colour: str, **more: Any) -> Trace:
-    """Return a trace of markers; `more`: further keys of the trace."""
+    """Return a trace of markers; `more`: further keys of the trace.
+
+    >>> markers("darks", [0.0, 1.0], [64.0, 64.5], "#888888")["mode"]
+    'markers'
+    """
     return {
         "type": "scatter",
         "mode": "markers",
@@ -51,7 +55,11 @@ def markers(name: str, x: Sequence[float], y: Sequence[float], colour: str, **mo
 
 
 def curve(name: str, x: Sequence[float], y: Sequence[float], colour: str, dash: str = "solid", **more: Any) -> Trace:
-    """Return a trace of lines; `more`: further keys of the trace."""
+    """Return a trace of lines; `more`: further keys of the trace.
+
+    >>> curve("K", [0.0, 1.0], [0.0, 0.4], "#888888", "dot")["line"]["dash"]
+    'dot'
+    """
     return {
         "type": "scatter",
         "mode": "lines",
@@ -143,9 +151,17 @@ def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane:
 
 
 def spectrogram(image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (cycles/px) and rms amplitude along the rows of an image: the root of the mean power spectrum of its
-    rows, scaled so that a white pattern of standard deviation s has the amplitude s at every frequency. Frequency 0 is
-    left out."""
+    """Return frequencies (cycles/px) and rms amplitude along the rows of an image; frequency 0 is left out.
+
+    image : (rows, cols)
+
+    It is the root of the mean power spectrum of the rows, scaled so that a white pattern of standard deviation s has the
+    amplitude s at every frequency, as in the spectrograms of EMVA 1288.
+
+    >>> frequency, amplitude = spectrogram(np.random.default_rng(1).normal(0.0, 2.0, (500, 64)))
+    >>> bool(abs(np.sqrt(np.mean(amplitude[:-1] ** 2)) - 2.0) < 3.0 * 2.0 / np.sqrt(2.0 * 500 * 64))
+    True
+    """
     length = image.shape[1]
     power = np.mean(np.abs(np.fft.rfft(image - image.mean(), axis=1)) ** 2, axis=0) / length
     return np.asarray(np.fft.rfftfreq(length)[1:], float), np.asarray(np.sqrt(power[1:]), float)

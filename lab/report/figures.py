@@ -137,7 +137,11 @@ def stereo_figures(stereo: StereoFit) -> Iterator[KeyFigure]:
 
 
 def rotation_vector_mrad(rotation: tuple[tuple[float, float, float], ...]) -> tuple[float, float, float]:
-    """Rotation vector (axis times angle, mrad) of a rotation matrix, for the small rotations of a stereo pair."""
+    """Return the rotation vector (axis times angle, mrad) of a rotation matrix (3, 3), for small rotations of a stereo pair.
+
+    >>> rotation_vector_mrad(((1.0, -0.001, 0.0), (0.001, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    (0.0, 0.0, 1.0)
+    """
     cosine = min(1.0, max(-1.0, (rotation[0][0] + rotation[1][1] + rotation[2][2] - 1) / 2))
     angle = math.acos(cosine)
     scale = 500.0 if angle < 1e-8 else 500.0 * angle / math.sin(angle)

@@ -96,8 +96,18 @@ def coverage(geometry: GeometryFit) -> Figure | None:
 
 
 def lines_of_vectors(at: FloatArray, vector: FloatArray, shape: tuple[float, float], name: str) -> list[Trace]:
-    """Vectors (n, 2) at positions (n, 2) in a frame of `shape` (rows, cols), x and y in px, drawn as lines enlarged by
-    a round number."""
+    """Draw vectors in a frame as lines, enlarged by a round number.
+
+    at, vector : places and vectors, (n, 2), x and y in px
+    shape : rows and columns of the frame
+    name : of the trace, to which the factor is added
+
+    Returns two traces: the lines and the places.
+
+    >>> lines, places = lines_of_vectors(np.array([[10.0, 20.0]]), np.array([[0.1, 0.0]]), (480.0, 640.0), "residuals")
+    >>> places["x"], places["y"]
+    ([10.0], [20.0])
+    """
     usual = max(float(np.percentile(np.linalg.norm(vector, axis=1), 95)), 1e-9)
     wanted = ARROWS * shape[1] / usual
     scale = max([factor for factor in SCALES if factor <= wanted], default=SCALES[0])

@@ -60,8 +60,11 @@ class Changes(Frozen):
 
 
 def parse_changes(text: str) -> Changes:
-    """Return the changes of `key=value,key=value`. Raises InputError for an unknown key and a value that can't be
-    used."""
+    """Return the changes of `key=value,key=value`. Raises InputError for an unknown key and a value that can't be used.
+
+    >>> parse_changes("temperature_c=35, exposure_factor=2").temperature_c
+    35.0
+    """
     values: dict[str, str] = {}
     known = ", ".join(Changes.model_fields)
     for part in filter(None, (entry.strip() for entry in text.split(","))):
@@ -75,7 +78,16 @@ def parse_changes(text: str) -> Changes:
 
 
 def validate_changes(values: Mapping[str, Any], where: str) -> Changes:
-    """Return the changes of these values. Raises InputError, beginning with `where`, for one that can't be used."""
+    """Return changes of the camera or of the light, checked.
+
+    values : by key, as a request or a command line states them
+    where : beginning of the message
+
+    Raises InputError for one that can't be used.
+
+    >>> validate_changes({"temperature_c": 35.0}, "--change ").temperature_c
+    35.0
+    """
     try:
         return Changes.model_validate(values)
     except ValidationError as error:

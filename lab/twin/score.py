@@ -413,5 +413,9 @@ def _quantity(name: str, numbers: list[ScoredNumber], value: float) -> QuantityS
 
 
 def title(quantity: str) -> str:
-    """Return a quantity as a lab reads it."""
+    """Return the name of a predicted quantity in words.
+
+    >>> title("slanted_edge")
+    'transfer function of slanted edges'
+    """
     return measurement_title(quantity)

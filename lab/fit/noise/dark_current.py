@@ -61,13 +61,21 @@ class SensorTemperature(Frozen):
 
 
 def temperature_law(rates: Sequence[tuple[float, float, float]], gain_error: float = 0.0) -> DarkCurrentLaws:
-    """Return the Arrhenius law and the doubling temperature of EMVA 1288 through dark currents `rates`: (deg C, e/s,
-    its standard deviation).
+    """Fit the Arrhenius law and the doubling temperature of EMVA 1288 to dark currents.
 
         ln I = ln I_ref - E / k (1/T - 1/T_ref),    ln I = a + ln 2 (T - T_ref) / T_d
 
-    Weighted lines, T_ref the coldest temperature. Only currents above three standard deviations are used; two
-    temperatures are needed. `gain_error`: relative error of the gain, common to all.
+    Weighted lines, T_ref the coldest temperature.
+
+    rates : (temperature in deg C, dark current in e/s, its standard deviation) of each measurement; only currents above
+        three standard deviations are used, at two temperatures or more
+    gain_error : relative error of the gain, common to all
+
+    Returns the measurements alone where fewer than two temperatures have a significant current.
+
+    >>> law = temperature_law([(20.0, 10.0, 0.1), (27.0, 20.0, 0.1), (34.0, 40.0, 0.1)])
+    >>> round(law.doubling_temperature_c, 2)
+    7.0
     """
     listed = np.array(rates, float)
     plain = DarkCurrentLaws(

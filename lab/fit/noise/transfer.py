@@ -66,11 +66,22 @@ def fit_transfer(
     light: NDArray[np.bool_],
     saturation: float,
 ) -> TransferFit:
-    """Conversion gain, curvature and dark variances from points (n,) of all planes.
+    """Fit conversion gain, curvature and dark variances to photon-transfer points (n,) of all planes.
 
-    `signal`: mean above black, DN. `variance`: temporal variance, DN^2, with the standard deviation of its sampling.
-    `plane`: index 0.. . `light`: False for darks. `saturation`: DN above black. All points are taken as unsaturated;
-    those above 90 % of saturation are left out. The method: `lab.fit.noise`.
+    signal : mean above black, DN
+    variance, variance_std : temporal variance, DN^2, and the standard deviation of its sampling
+    plane : index of the plane, 0..
+    light : False for darks
+    saturation : DN above black; points above 90 % of it are left out, all others are taken as unsaturated
+
+    Source: the photon transfer method of EMVA 1288, section 6; the weights and the curvature: `lab.fit.noise`.
+
+    >>> signal = np.array([0.0, 100.0, 200.0, 300.0, 400.0, 500.0])
+    >>> variance = 4.0 + 0.5 * signal
+    >>> plane, light = np.zeros(6, int), signal > 0.0
+    >>> fit = fit_transfer(signal, variance, 0.01 * variance, plane, light, 1000.0)
+    >>> round(fit.gain, 3), round(float(fit.floor[0]), 2)
+    (0.5, 4.0)
     """
     points = TransferPoints(signal, variance, variance_std / variance, plane, light, saturation)
     for limit in (CURVE_LIMIT, LINE_LIMIT):

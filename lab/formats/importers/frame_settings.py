@@ -81,7 +81,11 @@ OTHER_PARTS = ("WIND", "GUIDE", "MOTOR", "SLEW")
 
 
 def setting_of(keyword: str) -> FrameSetting | None:
-    """Return the setting that a keyword states, by the list or by a part of its name; None where it states none."""
+    """Return the setting that a header's keyword states, by the list or by a part of its name; None where it states none.
+
+    >>> setting_of("GAIN").keywords[0], setting_of("OBSERVER")
+    ('GAIN', None)
+    """
     if keyword in KEYWORDS:
         return KEYWORDS[keyword]
     name = keyword.upper()
@@ -258,7 +262,16 @@ ALL_FRAMES = HeaderChoice()
 
 
 def parse_choice(only: str, ignored: str) -> HeaderChoice:
-    """Return `--only KEY=VALUE,...` and `--ignore KEY,...` as a choice. Raises InputError, naming the option."""
+    """Return which frames to import by their headers, and which keywords to ignore.
+
+    only : `KEY=VALUE,...` of `--only`
+    ignored : `KEY,...` of `--ignore`
+
+    Raises InputError, which names the option.
+
+    >>> parse_choice("GAIN=100", "OFFSET").only
+    (('GAIN', '100'),)
+    """
     pairs = []
     for part in filter(None, (text.strip() for text in only.split(","))):
         keyword, equals, value = (text.strip() for text in part.partition("="))

@@ -138,8 +138,15 @@ def _columns() -> list[str]:
 
 
 def capture_of_row(row: dict[str, str]) -> dict[str, Any]:
-    """Return a row as a capture's keys: lists and numbers out of their cells, `screen.x` into `screen`. Raises
-    InputError without the row."""
+    """Return a row of an index as a capture's keys: lists and numbers out of their cells, `screen.x` into `screen`.
+
+    row : cells by column
+
+    Raises InputError without the row.
+
+    >>> capture_of_row({"frame": "edge.tif", "kind": "slanted_edge", "region": "0 0 64 64"})["region"]
+    [0, 0, 64, 64]
+    """
     if "frame" not in row or "kind" not in row:
         raise InputError("the frame or its kind is missing; write both")
     if row["kind"] == "checkerboard" and "squares" in row and "square_mm" in row:

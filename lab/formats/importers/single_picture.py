@@ -69,7 +69,13 @@ class ImportOptions:
 
 
 def grid(option: str, text: str) -> tuple[int, int] | None:
-    """ROWSxCOLS as two numbers; None where `text` is empty. Raises InputError, with the option's name."""
+    """Return ROWSxCOLS as two numbers; None where `text` is empty.
+
+    option : its name, with which an InputError begins
+
+    >>> grid("--squares", "6x9")
+    (6, 9)
+    """
     if not text:
         return None
     match = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
@@ -79,8 +85,13 @@ def grid(option: str, text: str) -> tuple[int, int] | None:
 
 
 def chart_corners(option: str, text: str) -> tuple[tuple[float, float], ...] | None:
-    """Eight numbers with commas as four corners (row, col); None where `text` is empty. Raises InputError, with the
-    option's name."""
+    """Return eight numbers with commas as four corners (row, col), px; None where `text` is empty.
+
+    option : its name, with which an InputError begins
+
+    >>> chart_corners("--corners", "10,20,10,620,470,620,470,20")[1]
+    (10.0, 620.0)
+    """
     if not text:
         return None
     try:

@@ -452,7 +452,11 @@ def same_exposure(stated_s: float | None, header: FrameHeader) -> bool:
 
 
 def same_f_number(stated: float | None, header: float | None) -> bool:
-    """Return whether two f-numbers are one marking; yes where one is unknown."""
+    """Return whether two f-numbers are one marking; yes where one is unknown.
+
+    >>> same_f_number(2.8, 2.83), same_f_number(2.8, 4.0), same_f_number(None, 4.0)
+    (True, False, True)
+    """
     return not stated or not header or max(stated / header, header / stated) <= F_NUMBER_FACTOR
 
 
