@@ -74,8 +74,8 @@ _MEANINGS = {
 
 
 def answers(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return OpenAPI's error responses of a route. They are problem details whatever the route returns, so that FastAPI's
-    `model` doesn't fit.
+    """Return OpenAPI's error responses of a route. They are problem details whatever the route returns, so that
+    FastAPI's `model` doesn't fit.
 
     >>> list(answers(404, 422))
     [404, 422]

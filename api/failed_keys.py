@@ -21,8 +21,8 @@ ADDRESSES = 10_000
 
 
 def network_of(address: str) -> str:
-    """Return what is counted as one address: an IPv4 address, or the 64 bits of an IPv6 network, of which a client has all
-    addresses.
+    """Return what is counted as one address: an IPv4 address, or the 64 bits of an IPv6 network, of which a client has
+    all addresses.
 
     >>> network_of("192.0.2.1"), network_of("2001:db8::1")
     ('192.0.2.1', '2001:db8::/64')

@@ -56,8 +56,8 @@ def lamp_radiance(wavelength_nm: FloatArray, temperature_k: float = 3050.0) -> F
     wavelength_nm : (m,)
     temperature_k : of the tungsten-halogen lamp
 
-    Planck's law with the emissivity of tungsten falling from 0.47 to 0.33, behind glass that is opaque below 385 nm and a
-    heat filter that is opaque above 730 nm (half-way points), scaled to 0.03 at 560 nm.
+    Planck's law with the emissivity of tungsten falling from 0.47 to 0.33, behind glass that is opaque below 385 nm and
+    a heat filter that is opaque above 730 nm (half-way points), scaled to 0.03 at 560 nm.
 
     >>> lamp_radiance(np.array([560.0])).round(6).tolist()
     [0.03]
@@ -116,7 +116,8 @@ def grating_efficiency(wavelength_nm: FloatArray) -> FloatArray:
 
 
 def filter_transmittance(place: int, wavelength_nm: FloatArray) -> FloatArray:
-    """Return the transmittance of one place of the wheel: a long-pass with an edge 6 nm wide, 0.91 above it, 1e-5 below.
+    """Return the transmittance of one place of the wheel: a long-pass with an edge 6 nm wide, 0.91 above it, 1e-5
+    below.
 
     place : 1..6; an empty place transmits everything
     wavelength_nm : (m,)

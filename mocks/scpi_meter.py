@@ -19,7 +19,8 @@ _RANGE_A = 0.02
 
 
 def responsivity_a_per_w(wavelength_nm: FloatArray) -> FloatArray:
-    """Return the responsivity (A/W) of a silicon photodiode, whose quantum efficiency falls off towards 300 nm and 1100 nm.
+    """Return the responsivity (A/W) of a silicon photodiode, whose quantum efficiency falls off towards 300 nm and 1100
+    nm.
 
     wavelength_nm : (m,)
 

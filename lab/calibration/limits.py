@@ -124,7 +124,8 @@ class Limit(Frozen):
         return f"<= {high:g}" if low is None else f">= {low:g}" if high is None else f"{low:g} .. {high:g}"
 
     def judge(self, figure: Figure) -> Mark:
-        """Return in which band the figure lies, the whole interval of two standard deviations on each side (ISO 14253-1).
+        """Return in which band the figure lies, the whole interval of two standard deviations on each side (ISO
+        14253-1).
 
         >>> limit = Limit(figure="noise read_noise_e", good=(None, 3.0), warn=(None, 4.0))
         >>> limit.judge(Figure(name="noise read_noise_e", side="left", place="", value=2.9, std=0.1))
@@ -185,7 +186,8 @@ def judge_figures(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tup
     figures : of a calibration, as `figures_of` lists them
     limits : of the laboratory
 
-    Returns a judgement for each pair of limit and figure. A limit that concerns no figure has one of its own, `missing`.
+    Returns a judgement for each pair of limit and figure. A limit that concerns no figure has one of its own,
+    `missing`.
 
     >>> limits = CalibrationLimits(limit=(Limit(figure="noise read_noise_e", good=(None, 3.0)),))
     >>> figure = Figure(name="noise read_noise_e", side="left", place="", value=2.0, std=0.1)

@@ -191,7 +191,8 @@ def _imaging(
 
 
 def lens_cache() -> Path:
-    """Return the folder where traced lenses' tables are kept: CALIBENCH_CACHE, else the platform's own place for such files.
+    """Return the folder where traced lenses' tables are kept: CALIBENCH_CACHE, else the platform's own place for such
+    files.
 
     >>> import os
     >>> os.environ["CALIBENCH_CACHE"] = "/data/lenses"
@@ -448,8 +449,8 @@ def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> Camer
 def default_camera() -> CameraFile:
     """Return a plausible RGB machine-vision camera: 1280 x 960 px of 3.45 um, 12 bit, global shutter, f/4, 8 mm.
 
-    Its values are like those of data sheets of 1/3 inch sensors. Its curves, with an infrared-cut filter at 650 nm, have
-    typical shapes and are of no particular maker.
+    Its values are like those of data sheets of 1/3 inch sensors. Its curves, with an infrared-cut filter at 650 nm,
+    have typical shapes and are of no particular maker.
 
     >>> import calibench
     >>> camera = calibench.default_camera().camera

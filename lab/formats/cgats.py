@@ -128,8 +128,8 @@ def plain_csv(text: str) -> tuple[str, tuple[str, ...]]:
 
     text : the table; what has commas in its first line stays as it is
 
-    Returns the table and remarks on what was changed. Raises InputError where numbers of both kinds stand in it, or where
-    a comma may separate decimals or thousands.
+    Returns the table and remarks on what was changed. Raises InputError where numbers of both kinds stand in it, or
+    where a comma may separate decimals or thousands.
 
     >>> plain_csv("wavelength_nm;value\n400;0,5\n")
     ('wavelength_nm,value\n400,0.5\n', ('read with semicolons between cells and decimal commas',))
@@ -186,8 +186,8 @@ def _with_points(cell: str) -> str:
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str | None:
-    """Return the known name that `name` is probably meant to be: the same with another unit, its beginning, or a misspelling
-    of it; None where there is none.
+    """Return the known name that `name` is probably meant to be: the same with another unit, its beginning, or a
+    misspelling of it; None where there is none.
 
     name : as somebody wrote it
     known : names that there are
@@ -338,7 +338,8 @@ def parse_cgats(text: str) -> CgatsSpectra:
     """Return the spectra in CGATS text.
 
     A spectrum has its SAMPLE_NAME where these differ, else its SAMPLE_ID, or both; of several tables, the table's
-    condition or number before it where the names don't differ. Raises InputError without the path, which the caller knows.
+    condition or number before it where the names don't differ. Raises InputError without the path, which the caller
+    knows.
 
     >>> text = '''CGATS.17
     ... SPECTRAL_BANDS "2"

@@ -13,8 +13,8 @@ from sim.spectrum import Spectrum
 def parse_spectrum(text: str) -> Spectrum:
     r"""Return a spectrum from CSV text with the header `wavelength_nm,value`.
 
-    Blank lines and a byte-order mark are ignored. Wavelengths must ascend strictly, and all numbers must be finite. Raises
-    InputError without the path, which the caller knows.
+    Blank lines and a byte-order mark are ignored. Wavelengths must ascend strictly, and all numbers must be finite.
+    Raises InputError without the path, which the caller knows.
 
     >>> parse_spectrum("wavelength_nm,value\n400,0.5\n500,1.0\n").value
     (0.5, 1.0)

@@ -155,8 +155,8 @@ def spectrogram(image: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     image : (rows, cols)
 
-    It is the root of the mean power spectrum of the rows, scaled so that a white pattern of standard deviation s has the
-    amplitude s at every frequency, as in the spectrograms of EMVA 1288.
+    It is the root of the mean power spectrum of the rows, scaled so that a white pattern of standard deviation s has
+    the amplitude s at every frequency, as in the spectrograms of EMVA 1288.
 
     >>> frequency, amplitude = spectrogram(np.random.default_rng(1).normal(0.0, 2.0, (500, 64)))
     >>> bool(abs(np.sqrt(np.mean(amplitude[:-1] ** 2)) - 2.0) < 3.0 * 2.0 / np.sqrt(2.0 * 500 * 64))

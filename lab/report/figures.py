@@ -137,7 +137,8 @@ def stereo_figures(stereo: StereoFit) -> Iterator[KeyFigure]:
 
 
 def rotation_vector_mrad(rotation: tuple[tuple[float, float, float], ...]) -> tuple[float, float, float]:
-    """Return the rotation vector (axis times angle, mrad) of a rotation matrix (3, 3), for small rotations of a stereo pair.
+    """Return the rotation vector (axis times angle, mrad) of a rotation matrix (3, 3), for small rotations of a stereo
+    pair.
 
     >>> rotation_vector_mrad(((1.0, -0.001, 0.0), (0.001, 1.0, 0.0), (0.0, 0.0, 1.0)))
     (0.0, 0.0, 1.0)

@@ -609,12 +609,12 @@ def estimate_kernel(
     sharp, blurred : (rows, cols)
     support : rows and columns of the kernel, odd
     noise_std : standard deviation of the noise, in the unit of `blurred`; by default it is estimated from the residual
-    register : where the residual shows that `sharp` was drawn a little off its place (`displacement`), refine the places
-        together with the kernel, except a common shift, which belongs to the kernel
+    register : where the residual shows that `sharp` was drawn a little off its place (`displacement`), refine the
+        places together with the kernel, except a common shift, which belongs to the kernel
 
-    Returns the kernel and its standard deviation, (support, support). Raises ValueError for arguments of the wrong shape
-    or size; `NotDetermined` where the picture is smaller than 2 x support, isn't finite or has no structure, or where
-    `sharp` doesn't explain `blurred`.
+    Returns the kernel and its standard deviation, (support, support). Raises ValueError for arguments of the wrong
+    shape or size; `NotDetermined` where the picture is smaller than 2 x support, isn't finite or has no structure, or
+    where `sharp` doesn't explain `blurred`.
 
     >>> import calibench
     >>> import numpy as np

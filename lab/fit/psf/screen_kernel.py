@@ -358,9 +358,9 @@ def expected_kernel(
     oversample : samples in a pixel
 
     The kernel is the least-squares solution on samples of 1 / `oversample` px that maps the drawing of a random pattern
-    to what the pixels record of it. Where a lens passes detail beyond what these samples resolve, it differs from samples
-    of the point-spread function, because borders of cells lie between the samples. With P the power spectrum of the
-    pattern, D the response of the drawing and H the transfer function, the normal equations at samples n, m are
+    to what the pixels record of it. Where a lens passes detail beyond what these samples resolve, it differs from
+    samples of the point-spread function, because borders of cells lie between the samples. With P the power spectrum of
+    the pattern, D the response of the drawing and H the transfer function, the normal equations at samples n, m are
 
         sum_m k(m) integral P D^2 exp(2 pi i f (n - m)) df = integral P D H exp(2 pi i f n) df
 

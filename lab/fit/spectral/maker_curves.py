@@ -110,7 +110,8 @@ def solve_with_maker(
 def compare_curves(
     wavelength_nm: FloatArray, channels: Sequence[str], value: FloatArray, covariance: FloatArray, stated: FloatArray
 ) -> tuple[float, tuple[MakerDeparture, ...]]:
-    """Find the wavelength bands in which fitted curves differ from stated ones, up to one factor that all channels share.
+    """Find the wavelength bands in which fitted curves differ from stated ones, up to one factor that all channels
+    share.
 
     wavelength_nm : (m,)
     channels : their names
@@ -118,9 +119,9 @@ def compare_curves(
     covariance : of `value`, without what is common to all
 
     The factor is the median of value / stated where `stated` is above a fifth of its maximum: bands that differ don't
-    change it. Every band of neighbouring wavelengths of every channel is tested by its mean difference; the significance
-    (normal, two-sided) is corrected for the number of bands. Bands are taken by significance, each apart from those before
-    it, down to the level that curves which are as stated exceed in at most 1 % of fits.
+    change it. Every band of neighbouring wavelengths of every channel is tested by its mean difference; the
+    significance (normal, two-sided) is corrected for the number of bands. Bands are taken by significance, each apart
+    from those before it, down to the level that curves which are as stated exceed in at most 1 % of fits.
 
     Returns the factor and the bands.
 

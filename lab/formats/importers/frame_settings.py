@@ -81,7 +81,8 @@ OTHER_PARTS = ("WIND", "GUIDE", "MOTOR", "SLEW")
 
 
 def setting_of(keyword: str) -> FrameSetting | None:
-    """Return the setting that a header's keyword states, by the list or by a part of its name; None where it states none.
+    """Return the setting that a header's keyword states, by the list or by a part of its name; None where it states
+    none.
 
     >>> setting_of("GAIN").keywords[0], setting_of("OBSERVER")
     ('GAIN', None)

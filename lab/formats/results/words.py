@@ -144,7 +144,8 @@ def format_unit(unit: str) -> str:
 
 
 def plain_number(value: float, digits: int) -> str:
-    """Return a number with `digits` significant digits at most, and without a power of ten where it is from 1e-9 to 1e6.
+    """Return a number with `digits` significant digits at most, and without a power of ten where it is from 1e-9 to
+    1e6.
 
     >>> plain_number(0.38214, 3), plain_number(12345.6, 4)
     ('0.382', '12,350')

@@ -178,9 +178,9 @@ def edge_mtf(
     frequency_cy_per_px : (frequencies,), 0..1 by 0.01 by default
     noise_std : in the unit of the region; by default it is estimated from the residuals on both sides of the edge
 
-    Returns MTF, its standard deviation, MTF50 and the angle: from the vertical, -90 to 90 deg, positive where the top of
-    the edge turns to the right. Raises `NotDetermined` where there is no single edge, ValueError for frequencies or a
-    `noise_std` that are not usable. The method: `lab.fit.mtf`.
+    Returns MTF, its standard deviation, MTF50 and the angle: from the vertical, -90 to 90 deg, positive where the top
+    of the edge turns to the right. Raises `NotDetermined` where there is no single edge, ValueError for frequencies or
+    a `noise_std` that are not usable. The method: `lab.fit.mtf`.
 
     >>> import calibench
     >>> import numpy as np
