@@ -52,7 +52,7 @@ class FailedKeys:
         return min(self.most, left + (self.clock() - at) * self.per_s)
 
     def wait_s(self, address: str) -> int:
-        """Whole seconds until a key from this address is compared again; 0: now."""
+        """Return the whole seconds until a key from this address is compared again; 0: now."""
         with self._lock:
             left = self._now(network_of(address))
         return 0 if left >= 1.0 else math.ceil((1.0 - left) / self.per_s)

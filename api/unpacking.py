@@ -245,7 +245,7 @@ def unpack(archive: Path, folder: Path, limit_bytes: int, limit_files: int) -> t
 
 
 def most_bytes(archive: Path) -> int:
-    """Bytes that an archive of this size may hold."""
+    """Return the bytes that an archive of this size may hold."""
     return MOST_RATIO * archive.stat().st_size + FREE_BYTES
 
 

@@ -108,7 +108,7 @@ class Inbox:
     root: Path
 
     def ids(self) -> list[str]:
-        """Ids of all, the newest first."""
+        """Return the ids of all, the newest first."""
         entries = [entry for entry in self.root.glob("*") if _ID.fullmatch(entry.name) and entry.is_dir()]
         return [entry.name for entry in sorted(entries, key=lambda entry: (-entry.stat().st_mtime_ns, entry.name))]
 
@@ -126,7 +126,7 @@ class Inbox:
 
     @contextlib.contextmanager
     def receiving(self) -> Iterator[Path]:
-        """A temporary folder for an archive while it arrives."""
+        """Yield a temporary folder for an archive while it arrives."""
         self.root.mkdir(parents=True, exist_ok=True)
         for left in self.root.glob(".*-*"):  # what a crash left
             if left.lstat().st_mtime < time.time() - _STALE_S:
@@ -177,7 +177,7 @@ class Inbox:
         return manifest
 
     def recordings(self, id: str) -> RecordingSet:
-        """Kept recordings, whose frames are checked when they are read."""
+        """Return kept recordings, whose frames are checked when they are read."""
         folder = self.folder(id)
         manifest, _ = recording.parse_manifest((folder / _MANIFEST).read_text(encoding="utf-8-sig"), _MANIFEST)
         return RecordingSet(manifest, source=id, files=FolderFiles(folder))

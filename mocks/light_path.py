@@ -154,7 +154,7 @@ def slit_function(wavelength_nm: FloatArray, centre_nm: float, fwhm_nm: float) -
 
 
 def sphere_radiance(light: LightSettings, wavelength_nm: FloatArray) -> FloatArray:
-    """Radiance (W sr^-1 m^-2 nm^-1) of the sphere's port for a setting of the light path.
+    """Return the radiance (W sr^-1 m^-2 nm^-1) of the sphere's port for a setting of the light path.
 
     Zero order passes all wavelengths. In first order at w the second order of w/2 leaves the slit at the same angle,
     with half the width in wavelength: only the filter wheel keeps it out. Stray light: 1e-6 of zero order. LEDs add

@@ -102,11 +102,11 @@ class Grammar(ABC):
         return []
 
     def fail_next(self, code: int | None) -> None:
-        """The next command fails with this code (None: `fault_code`)."""
+        """Let the next command fail with this code (None: `fault_code`)."""
         self._fail_with = self.fault_code if code is None else code
 
     def fail_no_more(self) -> None:
-        """The next command doesn't fail."""
+        """Let the next command not fail."""
         self._fail_with = None
 
     def _failure(self) -> int | None:
@@ -157,7 +157,7 @@ class FaultPlan:
         return bool(self._at or self._onwards)
 
     def of(self, number: int) -> list[Fault]:
-        """Those that break the answer of this number."""
+        """Return those that break the answer of this number."""
         return [*self._at.get(number, ()), *(fault for fault in self._onwards if fault.hits(number))]
 
 
@@ -217,7 +217,7 @@ class FaultyLine:
         self._arm()
 
     def receive(self, data: bytes) -> list[Output]:
-        """Byte by byte, so that an error meant for one command doesn't hit another that came with it."""
+        """Receive byte by byte, so that an error meant for one command doesn't hit another that came with it."""
         if not self.faults:
             return self._pass(self.grammar.receive(data))
         return list(itertools.chain.from_iterable(self._pass(self.grammar.receive(bytes((b,)))) for b in data))

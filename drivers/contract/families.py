@@ -51,15 +51,15 @@ class FamilyContract(ABC):
 
     @abstractmethod
     def everyday(self, driver: Any) -> None:
-        """A call that needs the instrument, and is right or raises `NotMet`."""
+        """Make a call that needs the instrument, and is right or raises `NotMet`."""
 
     @abstractmethod
     def takes_long(self, driver: Any) -> None:
-        """A call that takes seconds where the peer is slow."""
+        """Make a call that takes seconds where the peer is slow."""
 
     @abstractmethod
     def settings(self, driver: Any) -> None:
-        """What is within limits is done, what is beyond is refused."""
+        """Set what is within limits, and what is beyond, which has to be refused."""
 
     def is_safe(self, driver: Any) -> None:
         """Whether it is in its safe state; where that can't be asked, whether it works on."""

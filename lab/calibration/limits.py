@@ -62,7 +62,7 @@ class Figure(Frozen):
 
 
 def figures_of(fit: FitResult) -> tuple[Figure, ...]:
-    """All figures of a fit, each once."""
+    """Return all figures of a fit, each once."""
     figures: list[Figure] = []
     models = [(side, camera, "") for side, camera in fit.cameras.items()]
     parts = [*models, (None, fit.stereo, "stereo ")] if fit.stereo is not None else models

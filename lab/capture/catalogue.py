@@ -169,7 +169,7 @@ class StepTimes:
 
     @classmethod
     def learn(cls, seen: Iterable[tuple[Step, float]]) -> StepTimes:
-        """From steps and how long (s) each took."""
+        """Return the times that steps and how long (s) each took show."""
         taken = [(_work(step), _exposure_s(step), seconds) for step, seconds in seen]
         per_exposure = 1.0
         if len({exposure for _, exposure, _ in taken if exposure > 0}) > 1:
@@ -217,7 +217,7 @@ def _instruments(station: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
 
 
 def estimate(plan: CapturePlan, station: Station, times: StepTimes) -> PlanEstimate:
-    """Captures and time of a plan. Raises InputError where the station lacks what it needs."""
+    """Return captures and time of a plan. Raises InputError where the station lacks what it needs."""
     plan.steps(station)  # refuses what can't be taken as a whole
     planned = []
     for sequence in plan.sequences:

@@ -198,9 +198,9 @@ def remove_tree(folder: Path) -> None:
 
 @contextlib.contextmanager
 def acting_as_owner(owned: Path, made: Path | None = None) -> Iterator[None]:
-    """Within it, root acts as the user to whom the folder `owned` belongs, so that what is written belongs to that
-    user, and a link of that user leads nowhere that the user may not go. Other users, and root with folders of its own,
-    act as themselves.
+    """Let root act, within the block, as the user to whom the folder `owned` belongs, so that what is written belongs
+    to that user, and a link of that user leads nowhere that the user may not go. Other users, and root with folders of
+    its own, act as themselves.
 
     `made`: a folder that root makes for that user before. Raises InputError where it belongs to another user.
     """

@@ -162,15 +162,15 @@ class Capture(Open):
 
     @classmethod
     def unsupported(cls, document: dict[str, Any]) -> str | None:
-        """Why this version skips a capture that the format allows; None if it is supported."""
+        """Return why this version skips a capture that the format allows; None if it is supported."""
         return None
 
     def problems(self, rows: int, cols: int) -> Iterator[str]:
-        """Errors in the keys of a capture from a camera of `rows` x `cols` pixels: value, limit, remedy."""
+        """Yield the errors in the keys of a capture from a camera of `rows` x `cols` pixels: value, limit, remedy."""
         return iter(())
 
     def remarks(self) -> Iterator[str]:
-        """Warnings about the keys, with a remedy. The capture is used nevertheless."""
+        """Yield warnings about the keys, with a remedy. The capture is used nevertheless."""
         if (self.exposure_s or 0.0) > LONGEST_EXPOSURE_S:
             yield (
                 f"exposure_s is above {LONGEST_EXPOSURE_S:g} s: state it in seconds, not in milliseconds or "
@@ -193,7 +193,7 @@ def _mark(annotation: Any) -> Names | None:
 
 
 def names_in(item: Open) -> Iterator[tuple[str, Names, str]]:
-    """(dotted key, what it names, value) of every key of a manifest's object that names something."""
+    """Yield (dotted key, what it names, value) of every key of a manifest's object that names something."""
     for key, field in type(item).model_fields.items():
         value = getattr(item, key)
         if isinstance(value, Open):
@@ -526,7 +526,7 @@ def register(kind: type[Capture]) -> None:
 
 @contextmanager
 def registered(kind: type[Capture]) -> Iterator[None]:
-    """Context in which the kind is registered, too."""
+    """Register the kind within the block."""
     tables: tuple[dict[str, Any], ...] = (CAPTURES.models, TARGETS.models, SEQUENCES)
     before = [dict(table) for table in tables]
     try:

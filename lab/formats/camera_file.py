@@ -414,7 +414,7 @@ def _parameters(model: BaseModel, skip: Sequence[str] = ()) -> Iterator[str]:
 
 
 def describe_quantity(quantity: Quantity) -> str:
-    """Unit, meaning and bounds of a parameter, as they stand in the file's comments and in the documentation."""
+    """Return unit, meaning and bounds of a parameter, as they stand in the file's comments and in the documentation."""
     bounds = ["" if limit is None else f"{limit:g}" for limit in (quantity.lower, quantity.upper)]
     limits = f" ({bounds[0]} .. {bounds[1]})".replace("( ..", "(..").replace(".. )", "..)") if any(bounds) else ""
     return f"{quantity.unit}: {quantity.meaning}{limits}"

@@ -73,7 +73,10 @@ def installed_versions() -> dict[str, str]:
 
 
 def provenance_of(recordings: RecordingSet, made: datetime | None = None) -> Provenance:
-    """Provenance of an evaluation of `recordings`: reads every frame once. `made`: now, where not given."""
+    """Return the provenance of an evaluation of `recordings`, of which every frame is read once.
+
+    made : time of the evaluation; now by default
+    """
     digests = {
         capture.id: hashlib.sha256(recordings.frame(capture).astype("<u2").tobytes()).hexdigest()
         for capture in recordings.captures()

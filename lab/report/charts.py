@@ -155,7 +155,7 @@ def band(
 
 
 def photon_transfer(noise: NoiseFit) -> Figure | None:
-    """Temporal variance against signal, with the line of the fitted conversion gain."""
+    """Draw temporal variance against signal, with the line of the fitted conversion gain."""
     if noise.photon_transfer is None:
         return None
     return photon_transfer_points(
@@ -208,8 +208,9 @@ def photon_transfer_points(points: PhotonTransfer, gain: float | None = None, ga
 
 
 def repeat_drift(drift: RepeatDrift) -> Figure:
-    """Means of repeats over time, with the fitted curve where it changes and its standard uncertainty, DN; of several
-    settings in common, departures from each setting's mean."""
+    """Draw the means of repeats over time, with the fitted curve where it changes and its standard uncertainty, DN; of
+    several settings in common, departures from each setting's mean.
+    """
     curve, half = np.array(drift.curve_dn), np.array(drift.curve_dn_std)
     abscissa = "elapsed time, s" if drift.elapsed_s is not None else "number of the repeat"
     x = list(drift.elapsed_s) if drift.elapsed_s is not None else [float(k + 1) for k in range(len(curve))]
@@ -240,7 +241,7 @@ def repeat_drift(drift: RepeatDrift) -> Figure:
 
 
 def linearity(noise: NoiseFit) -> Figure | None:
-    """Deviation from the straight line of the response, per cent of the line."""
+    """Draw the deviation from the straight line of the response, per cent of the line."""
     points = noise.photon_transfer
     if points is None:
         return None
@@ -442,7 +443,9 @@ def overlay_validated(checks: Sequence[tuple[Check, Check | None]]) -> dict[str,
 
 
 def overlay_explained(curves: Sequence[ResidualCurve], measurement: str = "slanted_edge") -> dict[str, list[Overlay]]:
-    """Panel title -> curves of one measurement from the diagnosis; where a curve exists twice, the held-out one."""
+    """Return the curves of one measurement from the diagnosis, by panel title; where a curve exists twice, the held-out
+    one.
+    """
     chosen: dict[tuple[str, str], ResidualCurve] = {}
     for curve in curves:
         key = (curve.label, curve.channel)
@@ -465,8 +468,9 @@ def _legend(name: str, **look: Any) -> Trace:
 def transfer_overlays(
     panels: Mapping[str, Sequence[Overlay]], columns: int = 3, model: str = "baseline"
 ) -> Figure | None:
-    """Measured MTF (points), the baseline's prediction (dashed), and the improved model's (solid) where effects were
-    named."""
+    """Draw measured MTF (points), the baseline's prediction (dashed), and the improved model's (solid) where effects
+    were named.
+    """
     if not panels:
         return None
     columns = min(columns, len(panels))
@@ -631,7 +635,7 @@ def patch_comparison(patches: Sequence[PatchComparison], improved: Sequence[Patc
 
 
 def mismatch_map(diagnosis: DiagnosisResult) -> Figure | None:
-    """Significance of the baseline's mismatches by axis, one row for each side and measurement."""
+    """Draw the significance of the baseline's mismatches by axis, one row for each side and measurement."""
     if not diagnosis.mismatches:
         return None
     rows = list(dict.fromkeys((item.side, item.measurement) for item in diagnosis.mismatches))
@@ -748,7 +752,7 @@ def _beside_residuals(said: str, colour: str, place: int) -> dict[str, Any]:
 
 
 def residual_curve(curve: ResidualCurve) -> Figure:
-    """One measurement with both models' predictions, and below it the residuals in standard deviations."""
+    """Draw one measurement with both models' predictions, and below it the residuals in standard deviations."""
     std = np.maximum(np.asarray(curve.measured_std), 1e-12)
     seen = np.asarray(curve.measured)
     notes: list[dict[str, Any]] = []
@@ -817,7 +821,7 @@ def residual_curve(curve: ResidualCurve) -> Figure:
 
 
 def held_out_bars(diagnosis: DiagnosisResult) -> Figure | None:
-    """chi2 / n of both models on held-out captures; noise alone gives 1."""
+    """Draw chi2 / n of both models on held-out captures; noise alone gives 1."""
     held = diagnosis.held_out
     if held is None or held.n == 0:
         return None
@@ -887,8 +891,9 @@ class ChartData:
         return len(self._lines) - 1
 
     def pack(self) -> str:
-        """All figures, a line of JSON each, compressed, as base64: no text of theirs can end the element that holds
-        it."""
+        """Return all figures, a line of JSON each, compressed, as base64: no text of theirs can end the element that
+        holds it.
+        """
         return base64.b64encode(gzip.compress("\n".join(self._lines).encode(), mtime=0)).decode("ascii")
 
 

@@ -47,7 +47,7 @@ DEEPEST_SIGMA = 12.0
 
 
 def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[str, Any]:
-    """Variables of `diagnosis.html` besides the result itself."""
+    """Return the variables of `diagnosis.html` besides the result itself."""
     if diagnosis is None:
         return {}
     threshold = diagnosis.threshold
@@ -179,7 +179,7 @@ def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) ->
 
 
 def place_maps(diagnosis: DiagnosisResult, sides: Sequence[Side]) -> list[tuple[str, Figure]]:
-    """Heat maps of significance by measurement and axis, one for each side and model (baseline, and improved model
+    """Draw heat maps of significance by measurement and axis, one for each side and model (baseline, and improved model
     where effects were named)."""
     maps = []
     for side in sides:

@@ -524,7 +524,7 @@ def _dark_current(figures: Emva1288, colour: str) -> Iterator[EmvaPlot]:
 
 
 def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
-    """Plots of the joint fit: read noise of single pixels, dark current against temperature."""
+    """Yield the plots of the joint fit: read noise of single pixels, dark current against temperature."""
     spread = noise.read_noise_distribution
     if spread is not None:
         edges = np.array(spread.noise_e)

@@ -115,7 +115,8 @@ def trim_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> int:
 
 
 def patch_colours(patches: tuple[PatchComparison, ...]) -> dict[str, tuple[str, str]]:
-    """Patch -> (measured, predicted) as CSS colours: camera R, G, B balanced on the measured white patch, gamma 2.2.
+    """Return (measured, predicted) of each patch as CSS colours: camera R, G, B balanced on the measured white patch,
+    gamma 2.2.
 
     These are camera colours, not colorimetry. Both get the same balance, so that a difference on the page is one in the
     recording."""

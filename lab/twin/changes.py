@@ -148,7 +148,7 @@ def apply_changes(content: CameraFile, changes: Changes) -> CameraFile:
 
 
 def reference_temperature_c(content: CameraFile) -> float | None:
-    """Temperature of the sensor, C, that the model's dark current holds for; None where nobody says."""
+    """Return the temperature of the sensor, C, that the model's dark current holds for; None where nobody says."""
     if content.posterior is not None:
         return content.posterior.first.dark_temperature_c
     return content.camera.dark_current_reference_c
@@ -161,12 +161,12 @@ def has_dark_law(content: CameraFile) -> bool:
 
 
 def doubling_std_c(content: CameraFile) -> float:
-    """Standard deviation of the camera's own doubling temperature, C."""
+    """Return the standard deviation of the camera's own doubling temperature, C."""
     return content.camera.std.get("dark_current_doubling_c", DOUBLING_C_STD)
 
 
 def light_factor(content: CameraFile, changes: Changes) -> float:
-    """Factor on the light of all lit captures: dimmer lamps, and a nearer scene, whose image is larger."""
+    """Return the factor on the light of all lit captures: dimmer lamps, and a nearer scene, whose image is larger."""
     factor = changes.radiance_factor or 1.0
     if changes.distance_mm is None:
         return factor

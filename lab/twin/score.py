@@ -160,7 +160,9 @@ def conclusion(effects: Sequence[TestedEffect]) -> str:
 
 @one_blas_thread
 def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
-    """Predicted beside measured. Raises InputError where the recordings aren't of the session that was predicted."""
+    """Compare a sealed prediction with the measured session. Raises InputError where the recordings aren't of the
+    session that was predicted.
+    """
     for side, prediction in sealed.sides.items():
         check_session(prediction, recordings, side)
     numbers: list[ScoredNumber] = []

@@ -189,7 +189,7 @@ class TransferPoints:
     saturation: float
 
     def curve(self, used: NDArray[np.bool_], errors: tuple[float, float]) -> TransferCurve:
-        """Weighted least squares of the curve over the points `used` (n,), with a normal prior on its curvature.
+        """Fit the curve by weighted least squares over the points `used` (n,), with a normal prior on its curvature.
 
         `errors`: relative errors of the model in darks and in flats, in addition to sampling.
         """
@@ -215,8 +215,8 @@ class TransferPoints:
         return TransferCurve(solution, covariance, chi2, freedom, v - basis @ solution, std, fitted, leverage)
 
     def model_errors(self, used: NDArray[np.bool_], curve: TransferCurve) -> tuple[float, float]:
-        """Relative errors of the model in darks and in flats: those for which chi2 has its expected value; 0 where
-        sampling explains the residuals, for the flats the usual error where these are too few to tell
+        """Return the relative errors of the model in darks and in flats: those for which chi2 has its expected value; 0
+        where sampling explains the residuals, for the flats the usual error where these are too few to tell
         (`LEAST_FREEDOM`).
 
         Source: Paule and Mandel, J. Res. Natl. Bur. Stand. 87, 377 (1982).
@@ -247,8 +247,8 @@ class TransferPoints:
         return float(np.sqrt(squares[0])), float(np.sqrt(max(squares[1], least)))
 
     def dark_variances(self, error: float, gain: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """By plane: variance of the darks less the shot noise of their own signal (`gain` times it), its standard
-        deviation, and that signal.
+        """Return, by plane, the variance of the darks less the shot noise of their own signal (`gain` times it), its
+        standard deviation, and that signal.
         """
         values, stds, signals = [], [], []
         for index in range(int(self.plane.max()) + 1):

@@ -32,7 +32,7 @@ from sim.spectrum import Spectrum
 
 
 def read_image(file: Path, page: int | None = None) -> Frame:
-    """Grey values of an image file as uint16 (rows, cols), as stored; `page`: of a TIFF with several, or the
+    """Return the grey values of an image file as uint16 (rows, cols), as stored; `page`: of a TIFF with several, or the
     plane of a FITS cube. InputError without the path."""
     suffix = file.suffix.lower()
     if suffix == ".npy" or suffix in RAWS:
@@ -249,7 +249,7 @@ class TapFiles(ImageFiles):
 
 
 def parse_taps(listed: Any, where: str) -> tuple[Tap, ...]:
-    """`[[taps]]` of a camera file."""
+    """Return the taps that `[[taps]]` of a camera file lists, checked."""
     try:
         taps = tuple(Tap.model_validate(item) for item in listed)
     except (ValidationError, TypeError) as error:

@@ -63,7 +63,7 @@ class ImportOptions:
     ignore: str | None = None
 
     def stated(self) -> tuple[str, ...]:
-        """Names of the options that are stated, as on the command line."""
+        """Return the names of the options that are stated, as on the command line."""
         names = (field.name for field in fields(self))
         return tuple(f"--{name.replace('_', '-')}" for name in names if getattr(self, name) is not None)
 
@@ -144,8 +144,8 @@ def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
 
 
 def locate_chart(frame: Frame, camera: DataSheet) -> Corners | None:
-    """Corners of the grid of patches, [row, col] of dark skin, bluish green, black, white; None where no chart is
-    found.
+    """Find the corners of the grid of patches, [row, col] of dark skin, bluish green, black, white; None where no chart
+    is found.
 
     Patches are found by OpenCV's MCC detector in the mosaic binned to its period; a homography through the 24 centres
     gives the corners."""
@@ -369,7 +369,7 @@ def _check_grey_row(path: Path, frame: Frame, camera: DataSheet, corners: Corner
 
 
 def grey_levels(frame: Frame, corners: Corners) -> NDArray[np.floating[Any]]:
-    """Mean DN of the inner parts of the patches of the grey row, white first."""
+    """Return the mean DN of the inner parts of the patches of the grey row, white first."""
     corner, v = np.array(corners, float), (PATCH_ROWS - 0.5) / PATCH_ROWS
     half = max(int(0.15 * np.linalg.norm(corner[1] - corner[0]) / PATCH_COLS), 1)
     levels = []
