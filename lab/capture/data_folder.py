@@ -21,7 +21,7 @@ def open_store(folder: Path | None = None) -> Store:
 
 
 def existing_store(folder: Path | None = None) -> Store | None:
-    """Return the store of the data folder, as `open_store` finds it; None where there is none, as reading makes none."""
+    """Return the store of the data folder, as `open_store` finds it; None without one: reading makes none."""
     from lab.capture.settings import Settings
 
     settings = Settings() if folder is None else Settings(data=folder)
