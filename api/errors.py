@@ -51,7 +51,15 @@ MEDIA_TYPE = "application/problem+json"
 
 
 def problem(status: int, detail: str, headers: Mapping[str, str] | None = None) -> Response:
-    """Return an error response."""
+    """Return an error response: problem details (RFC 9457).
+
+    status : of HTTP
+    detail : one line: quantity, value, limit, remedy
+    headers : further ones
+
+    >>> problem(404, "no session 7").status_code
+    404
+    """
     body = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail)
     return Response(body.model_dump_json(), status, headers, MEDIA_TYPE)
 

@@ -47,7 +47,11 @@ class Permission(StrEnum):
 
 
 def new_key() -> str:
-    """Return a fresh key: 256 random bits behind a prefix that secret scanners can find."""
+    """Return a fresh key: 256 random bits behind a prefix that secret scanners can find.
+
+    >>> new_key().startswith(KEY_PREFIX), new_key() == new_key()
+    (True, False)
+    """
     return KEY_PREFIX + secrets.token_urlsafe(32)
 
 

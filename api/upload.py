@@ -37,7 +37,11 @@ _MODEL_FILES = 64
 
 
 def is_recordings(source: str) -> bool:
-    """Return whether an id is one of recordings that were sent in, not of a session."""
+    """Return whether an id is one of recordings that were sent in, not of a session.
+
+    >>> is_recordings("20300101-101500-7f3ad2")
+    False
+    """
     return _ID.fullmatch(source) is not None
 
 

@@ -587,7 +587,11 @@ def open_device(address: str) -> usb.core.Device:
 
 
 def in_words(error: usb.core.USBError) -> str:
-    """Return what an error says, without its number before and its name behind."""
+    """Return what an error says, without its number before and its name behind.
+
+    >>> in_words(usb_error(errno.ENODEV, "the camera"))
+    'the camera'
+    """
     return re.sub(r"^\[Errno -?\d+\] |: E[A-Z]+$", "", str(error))
 
 

@@ -89,8 +89,12 @@ def _colour_matching(first_nm: float, last_nm: float) -> FloatArray:
 
 
 def tristimulus(radiance: Spectrum) -> tuple[float, float, float]:
-    """Return X, Y, Z (CIE 1931, Y in cd/m2) of a spectral radiance in W sr^-1 m^-2 nm^-1: 683 x sum of L times each
-    function."""
+    """Return X, Y, Z (CIE 1931, Y in cd/m^2) of a radiance in W sr^-1 m^-2 nm^-1: 683 x sum of L times each function.
+
+    >>> from sim.scene.light import illuminant
+    >>> abs(tristimulus(illuminant("D65", 100.0))[1] - 100.0) < 1.0
+    True
+    """
     light = radiance.at(np.arange(360.0, 830.5, 1.0))
     x, y, z = (LUMINOUS_EFFICACY_LM_PER_W * float(np.sum(light * row)) for row in _colour_matching(360.0, 830.0))
     return x, y, z

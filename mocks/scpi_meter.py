@@ -32,8 +32,13 @@ def responsivity_a_per_w(wavelength_nm: FloatArray) -> FloatArray:
 
 
 def calibration_csv(departure_percent: float = 0.8) -> str:
-    """Return the calibration that came with the diode; `departure_percent` is by how much it is off, as real ones
-    are."""
+    """Return the calibration that came with the diode, as its driver reads it.
+
+    departure_percent : by how much it is off, as real ones are
+
+    >>> calibration_csv().splitlines()[0]
+    'wavelength_nm,responsivity_a_per_w'
+    """
     at = np.arange(300.0, 1101.0, 10.0)
     certified = responsivity_a_per_w(at) * (1.0 + departure_percent / 100.0 * np.sin(at / 180.0))
     return (

@@ -244,7 +244,11 @@ def _screen(camera: HiddenCamera, shown: ShownCells) -> Scene:
 
 
 def corners_px(warp: Warp, width: float, height: float) -> FloatArray:
-    """Return [row, col] of the corners (0, 0), (width, 0), (width, height), (0, height) of a target's plane."""
+    """Return [row, col] of the corners (0, 0), (width, 0), (width, height), (0, height) of a target's plane, px.
+
+    warp : from the plane to the camera's px
+    width, height : of the target, in the plane's unit
+    """
     row, col = warp.to_camera(np.array([0.0, width, width, 0.0]), np.array([0.0, 0.0, height, height]))
     return np.stack([row, col], axis=1)
 

@@ -57,8 +57,11 @@ def response(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
 def calibration_csv(departure_percent: float = 0.0) -> str:
     """Return the calibration that a laboratory would have sent with the instrument, as its driver reads it.
 
-    `departure_percent`: by how much it is off, smoothly over the spectrum; real ones are good to about 2 % (half of the
-    expanded uncertainty that calibration laboratories state for spectral radiance).
+    departure_percent : by how much it is off, smoothly over the spectrum; real ones are good to about 2 % (half of the
+        expanded uncertainty that calibration laboratories state for spectral radiance)
+
+    >>> calibration_csv().splitlines()[0]
+    'wavelength_nm,counts_per_s_per_w_sr_m2_nm'
     """
     at = np.arange(350.0, 1001.0, 2.0)
     certified = response(at) * (1.0 + departure_percent / 100.0 * np.sin(at / 90.0))

@@ -35,7 +35,15 @@ def require(holds: bool, otherwise: str) -> None:
 
 
 def require_refused(call: Callable[[], object], what: str) -> None:
-    """Raise `NotMet` unless the call ends with an `InstrumentError` of one line."""
+    """Raise `NotMet` unless the call ends with an `InstrumentError` of one line.
+
+    call : that has to be refused
+    what : it asks for, in words
+
+    >>> def open_shutter():
+    ...     raise InstrumentError("lamp: no shutter; leave it out")
+    >>> require_refused(open_shutter, "a shutter")
+    """
     try:
         call()
     except InstrumentError as error:

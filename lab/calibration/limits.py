@@ -62,7 +62,14 @@ class Figure(Frozen):
 
 
 def figures_of(fit: FitResult) -> tuple[Figure, ...]:
-    """Return all figures of a fit, each once."""
+    """Return all figures of a fit with a standard deviation, each once.
+
+    >>> from lab.formats.results import CameraFit, FitResult, NoiseFit
+    >>> noise = NoiseFit(read_noise_e=2.0, read_noise_e_std=0.1)
+    >>> fit = FitResult(source="my-camera", cameras={"left": CameraFit(noise=noise)})
+    >>> [(figure.name, figure.value) for figure in figures_of(fit)]
+    [('noise read_noise_e', 2.0)]
+    """
     figures: list[Figure] = []
     models = [(side, camera, "") for side, camera in fit.cameras.items()]
     parts = [*models, (None, fit.stereo, "stereo ")] if fit.stereo is not None else models
@@ -236,7 +243,15 @@ def standing_limits(folder: Path) -> CalibrationLimits | None:
 
 
 def read_limits(file: Path) -> CalibrationLimits:
-    """Return the limits of a TOML file. Raises InputError, one line for each problem."""
+    r"""Return the limits of a TOML file. Raises InputError, one line for each problem.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "limits.toml"
+    ...     _ = file.write_text('[[limit]]\nfigure = "noise read_noise_e"\ngood = [0.0, 3.0]\n')
+    ...     read_limits(file).limit[0].good_text
+    '0 .. 3'
+    """
     table = read_toml(file, "give a file of limits")
     try:
         return CalibrationLimits.model_validate(table)

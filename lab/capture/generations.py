@@ -112,7 +112,15 @@ def lock_of(backup: Path) -> Lock:
 
 
 def sha256_of(file: Path) -> str:
-    """Return a file's SHA-256."""
+    """Return a file's SHA-256, in hexadecimal digits.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "empty"
+    ...     file.touch()
+    ...     sha256_of(file)[:8]
+    'e3b0c442'
+    """
     with file.open("rb") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()
 
@@ -168,7 +176,18 @@ def sync_folder(folder: Path) -> None:
 
 
 def can_be_parsed(file: Path, name: Path) -> bool:
-    """Return whether a file with a name of .toml or .json is one; true for other files."""
+    """Return whether a file with a name of .toml or .json is one; true for other files.
+
+    file : whose content is read
+    name : that it has in the data folder
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "copy"
+    ...     _ = file.write_text("valid_days = ")
+    ...     can_be_parsed(file, Path("limits.toml"))
+    False
+    """
     parse = {".toml": tomllib.loads, ".json": json.loads}.get(name.suffix)
     try:
         if parse is not None:

@@ -311,8 +311,18 @@ def _first(error: Exception) -> str:
 def write_camera(file: Path, content: CameraFile) -> None:
     """Write a camera file that `read_camera` reads back to exactly the same camera.
 
+    file : TOML, to be written
+    content : the camera, its effects and its lens
+
     Measured point-spread and transfer functions go into an .npz file beside it; so does the table of a traced lens
     without a prescription.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "left.toml"
+    ...     write_camera(file, default_camera())
+    ...     read_camera(file).camera == default_camera().camera
+    True
     """
     text = "\n".join(_lines(file, content)) + "\n"
     with replacing(file) as partial:
@@ -414,7 +424,11 @@ def _parameters(model: BaseModel, skip: Sequence[str] = ()) -> Iterator[str]:
 
 
 def describe_quantity(quantity: Quantity) -> str:
-    """Return unit, meaning and bounds of a parameter, as they stand in the file's comments and in the documentation."""
+    """Return unit, meaning and bounds of a parameter, as they stand in the file's comments and in the documentation.
+
+    >>> describe_quantity(read_quantities(CameraModel)["read_noise_e"]).startswith("e")
+    True
+    """
     bounds = ["" if limit is None else f"{limit:g}" for limit in (quantity.lower, quantity.upper)]
     limits = f" ({bounds[0]} .. {bounds[1]})".replace("( ..", "(..").replace(".. )", "..)") if any(bounds) else ""
     return f"{quantity.unit}: {quantity.meaning}{limits}"

@@ -70,9 +70,17 @@ class ForeignText:
 
 
 def read_foreign_text(file: Path) -> ForeignText:
-    """Return the text of `file`: UTF-8, UTF-16 by its byte-order mark or its zeros, else Latin-1 (Windows-1252).
+    r"""Return the text of a file: UTF-8, UTF-16 by its byte-order mark or its zeros, else Latin-1 (Windows-1252).
 
-    Raises InputError, without the path, where the file can't be read or holds no text.
+    Returns the text with remarks on what was converted. Raises InputError, without the path, where the file can't be
+    read or holds no text.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "light.csv"
+    ...     _ = file.write_bytes("wavelength_nm,value\r\n400,0.5\r\n".encode("utf-16"))
+    ...     read_foreign_text(file).text.splitlines()
+    ['wavelength_nm,value', '400,0.5']
     """
     try:
         data = file.read_bytes()
@@ -115,8 +123,16 @@ def remarks_on(folder: Path, names: Iterable[str]) -> list[str]:
 
 
 def read_foreign_csv(file: Path) -> ForeignText:
-    """Return the table in `file` with commas between cells and decimal points, line for line. Raises InputError without
-    the path.
+    r"""Return the table in `file` with commas between cells and decimal points, line for line, and remarks.
+
+    Raises InputError without the path.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "light.csv"
+    ...     _ = file.write_text("wavelength_nm;value\n400;0,5\n")
+    ...     read_foreign_csv(file).text
+    'wavelength_nm,value\n400,0.5\n'
     """
     table = read_foreign_text(file)
     text, remarks = plain_csv(table.text)
@@ -245,8 +261,19 @@ class TableRow:
 
 
 def table_rows(file: Path, needed: Sequence[str], known: Sequence[str]) -> list[TableRow]:
-    """Return the rows of `file`, which has the columns `needed` and no others than `known`. Raises InputError with one
-    line.
+    r"""Return the rows of a table.
+
+    file : CSV in any of the forms that `plain_csv` knows
+    needed, known : columns that it must have, and those that it may have
+
+    Raises InputError with one line for an unknown or a missing column.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "levels.csv"
+    ...     _ = file.write_text("exposure_s,mean_dn\n0.01,100\n")
+    ...     table_rows(file, ["exposure_s"], ["exposure_s", "mean_dn"])[0].value("mean_dn")
+    100.0
     """
     try:
         reader = csv.reader(read_foreign_csv(file).text.splitlines())
@@ -569,10 +596,21 @@ def _number(text: str, what: str) -> float:
 
 
 def write_cgats(file: Path, content: CgatsSpectra) -> tuple[str, ...]:
-    """Write spectra as `.ti3` where the name ends so, else as `.sp`. Returns what was changed for the format.
+    """Write spectra as `.ti3` where the name ends so, else as `.sp`.
 
-    All spectra get one grid of even steps, the finest of them, as the format has no other. Raises InputError where that
-    has more bands than Argyll reads, or the quantity isn't stated.
+    file : to be written
+    content : spectra by name, and their quantity
+
+    All spectra get one grid of even steps, the finest of them, as the format has no other. Returns what was changed for
+    the format. Raises InputError where that has more bands than Argyll reads, or the quantity isn't stated.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> white = Spectrum(wavelength_nm=(400.0, 500.0, 600.0), value=(0.25, 0.5, 1.0))
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "white.sp"
+    ...     _ = write_cgats(file, CgatsSpectra({"white": white}, "radiance"))
+    ...     [spectrum.wavelength_nm for spectrum in read_cgats(file).spectra.values()]
+    [(400.0, 500.0, 600.0)]
     """
     if content.quantity is None:
         raise InputError(f"{file}: the quantity isn't stated; give one of {', '.join(_WRITTEN)}")

@@ -19,7 +19,12 @@ Result = TypeVar("Result", bound=BaseModel)
 
 
 def result_json(result: BaseModel) -> str:
-    """Return the text of a result's file."""
+    """Return a result as JSON text, as the commands write it with `--json`.
+
+    >>> from lab.formats.results import FitResult
+    >>> '"format": "calibench-fit"' in result_json(FitResult(source="my-camera", cameras={}))
+    True
+    """
     return result.model_dump_json(indent=1) + "\n"
 
 

@@ -65,6 +65,10 @@ def _quoted(row: list[str]) -> str:
 
 
 def format_spectrum(spectrum: Spectrum) -> str:
-    """Return a spectrum as the format's CSV; reading it gives the same numbers bit for bit."""
+    """Return a spectrum as CSV text; reading it gives the same numbers bit for bit.
+
+    >>> format_spectrum(Spectrum(wavelength_nm=(400.0, 500.0), value=(0.5, 1.0))).splitlines()
+    ['wavelength_nm,value', '400.0,0.5', '500.0,1.0']
+    """
     rows = (f"{at!r},{height!r}\n" for at, height in zip(spectrum.wavelength_nm, spectrum.value, strict=True))
     return "wavelength_nm,value\n" + "".join(rows)

@@ -115,6 +115,10 @@ def effect_line(effect: NamedEffect) -> str:
 def list_findings(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
     """Yield sentences on implausible figures, the named effects, mismatches without a name, and cameras without a
     mismatch.
+
+    >>> fit = FitResult(source="my-camera", cameras={}, warnings=("the read noise of 0.001 e is implausible",))
+    >>> any("0.001 e" in sentence for sentence in list_findings(fit, None))
+    True
     """
     yield from (f"Warning: {line}." for line in fit.warnings)
     if diagnosis is None:

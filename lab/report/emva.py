@@ -71,7 +71,14 @@ def curve(name: str, x: Sequence[float], y: Sequence[float], colour: str, dash: 
 
 
 def values_along(data: Sequence[Trace], key: str) -> list[float]:
-    """Return the coordinates `key` (x, y) of all traces, and the ends of their error bars."""
+    """Return the coordinates of all traces along an axis, and the ends of their error bars.
+
+    data : traces
+    key : `x` or `y`
+
+    >>> values_along([{"x": [1.0], "y": [5.0], "error_y": {"array": [0.5]}}], "y")
+    [5.0, 4.5, 5.5]
+    """
     values = [float(value) for trace in data for value in trace[key]]
     for trace in data:
         std = trace.get(f"error_{key}", {}).get("array", [])

@@ -71,7 +71,11 @@ def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[
 
 
 def mtf50_range(curves: tuple[MtfCurve, ...], channel: str) -> tuple[float, float, int] | None:
-    """Return (lowest, highest, number) of one channel's MTF50 over all edges, cy/px; None where no edge has one."""
+    """Return (lowest, highest, number) of one channel's MTF50 over all edges, cy/px; None where no edge has one.
+
+    >>> mtf50_range((), "G") is None
+    True
+    """
     mtf50 = [
         curve.mtf50_cy_per_px for curve in curves if curve.channel == channel and curve.mtf50_cy_per_px is not None
     ]

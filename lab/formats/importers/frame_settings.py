@@ -96,12 +96,24 @@ def setting_of(keyword: str) -> FrameSetting | None:
 
 
 def text_of(value: Value) -> str:
-    """Return a setting's value as it is written."""
+    """Return a setting's value as it is written; whole numbers without a decimal point.
+
+    >>> text_of(100.0), text_of("HIGH")
+    ('100', 'HIGH')
+    """
     return value if isinstance(value, str) else f"{value:.6g}"
 
 
 def is_same(keyword: str, first: Value, second: Value) -> bool:
-    """Return whether two values of a keyword are one setting."""
+    """Return whether two values of a keyword are one setting: equal, of texts but for case, or within the setting's
+    factor.
+
+    keyword : of the header
+    first, second : numbers or texts
+
+    >>> is_same("READMODE", "Low noise", "LOW NOISE"), is_same("GAIN", 100.0, 200.0)
+    (True, False)
+    """
     if isinstance(first, str) or isinstance(second, str):
         return text_of(first).casefold() == text_of(second).casefold()
     low, high = sorted((first, second))
@@ -296,7 +308,11 @@ def is_chosen(choice: HeaderChoice, kind: str, settings: Mapping[str, Value]) ->
 
 
 def states(settings: Mapping[str, Value], keyword: str, wanted: str) -> bool:
-    """Return whether settings hold a value that is written as `wanted`."""
+    """Return whether settings hold a value that is written as `wanted`.
+
+    >>> states({"GAIN": 100.0}, "GAIN", "100")
+    True
+    """
     try:
         value: Value = float(wanted)
     except ValueError:
