@@ -40,7 +40,7 @@ def _first_key(store: Store) -> None:
 
 
 def logging_config() -> dict[str, Any]:
-    """uvicorn's logging configuration, with a filter that removes keys from URLs."""
+    """Return uvicorn's logging configuration, with a filter that removes keys from URLs."""
     from uvicorn.config import LOGGING_CONFIG
 
     config = copy.deepcopy(LOGGING_CONFIG)
@@ -173,7 +173,7 @@ def create(
 
 @key.command("list")
 def list_keys(data: Folder = None) -> None:
-    """Names and scopes of all keys.
+    """List names and scopes of all keys.
 
     Example: calibench key list
     """

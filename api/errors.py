@@ -51,7 +51,15 @@ MEDIA_TYPE = "application/problem+json"
 
 
 def problem(status: int, detail: str, headers: Mapping[str, str] | None = None) -> Response:
-    """Return an error response."""
+    """Return an error response: problem details (RFC 9457).
+
+    status : of HTTP
+    detail : one line: quantity, value, limit, remedy
+    headers : further ones
+
+    >>> problem(404, "no session 7").status_code
+    404
+    """
     body = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail)
     return Response(body.model_dump_json(), status, headers, MEDIA_TYPE)
 
@@ -74,8 +82,12 @@ _MEANINGS = {
 
 
 def answers(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's error responses of a route. They are problem details whatever the route returns, so FastAPI's `model`
-    doesn't fit."""
+    """Return OpenAPI's error responses of a route. They are problem details whatever the route returns, so that
+    FastAPI's `model` doesn't fit.
+
+    >>> list(answers(404, 422))
+    [404, 422]
+    """
     content = {MEDIA_TYPE: {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}}
     return {status: {"description": _MEANINGS[status], "content": content} for status in statuses}
 

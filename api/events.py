@@ -15,7 +15,7 @@ KEEP_ALIVE_S = 15.0
 
 
 def event(name: str, content: BaseModel) -> ServerSentEvent:
-    """One event with a schema as its data."""
+    """Return an event with a schema as its data."""
     return ServerSentEvent(event=name, data=content.model_dump_json())
 
 
@@ -57,7 +57,7 @@ async def watch_state(
 
 
 def describe_events(*events: tuple[str, type[BaseModel], str]) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's description of a stream: each event's name, its data, and when it is sent."""
+    """Return OpenAPI's description of a stream: each event's name, its data, and when it is sent."""
     lines = [f"- `{name}`: {when}; its data is a `{model.__name__}`." for name, model, when in events]
     schema = {
         "type": "string",

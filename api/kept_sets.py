@@ -64,7 +64,7 @@ def session_set(service: Service, session_id: str) -> KeptSet:
 
 
 def find_sent_set(service: Service, recordings_id: str) -> KeptSet:
-    """Recordings that were sent in; 404 where there are none of that id."""
+    """Return recordings that were sent in; 404 where there are none of that id."""
     folder = service.recordings(recordings_id)
     inbox = service.inbox
     return KeptSet(

@@ -53,7 +53,7 @@ class Metrics:
         self._first_byte.labels(method, route).observe(seconds)
 
     def text(self) -> bytes:
-        """All metrics, as Prometheus reads them."""
+        """Return all metrics, as Prometheus reads them."""
         return generate_latest(self._registry)
 
 

@@ -30,7 +30,9 @@ class Pictures:
         self._figures = functools.lru_cache(FIGURES)(self._make_figures)
 
     def recordings(self, recordings_id: str) -> RecordingSet:
-        """Recordings that were sent in, read once for all who look at them. Raises InputError where there are none."""
+        """Return recordings that were sent in, read once for all who look at them. Raises InputError where there are
+        none.
+        """
         self._inbox.folder(recordings_id)
         return self._sent(recordings_id)
 

@@ -42,8 +42,9 @@ class Arrived:
 
 @contextlib.asynccontextmanager
 async def receive_archive(service: Service, request: Request, most_bytes: int) -> AsyncIterator[Arrived]:
-    """The archive of a request's body, `most_bytes` at most, while it is used. Raises 422 for another kind of body, and
-    413 or 507 where the body, or what is done with it, goes beyond a cap or the disk."""
+    """Receive the archive of a request's body, `most_bytes` at most, while it is used. Raises 422 for another kind of
+    body, and 413 or 507 where the body, or what is done with it, goes beyond a cap or the disk.
+    """
     sent = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if sent not in TYPES:
         raise HTTPException(422, f"Content-Type {sent[:60]!r}: send the archive itself, as {', '.join(ARCHIVES)}")

@@ -174,7 +174,11 @@ class Service:
 
 
 def missing_session(session_id: str) -> str:
-    """Return what is said of a session that isn't there."""
+    """Return what is said of a session that isn't there.
+
+    >>> missing_session("20300101")
+    "no session '20300101'; GET /api/v1/sessions lists them"
+    """
     return f"no session {session_id[:60]!r}; GET /api/v1/sessions lists them"
 
 

@@ -54,8 +54,13 @@ def check_room(folder: Path, wanted_bytes: int) -> None:
 
 
 def inside(name: str) -> PurePosixPath:
-    """Return a member's name as a path in the folder. Raises InputError for a path that leads out of it, and for a name
-    that some system couldn't keep."""
+    """Return a member's name as a path in the folder.
+
+    Raises InputError for a path that leads out of it, and for a name that some system couldn't keep.
+
+    >>> inside("frames/dark-1.npy")
+    PurePosixPath('frames/dark-1.npy')
+    """
     path = PurePosixPath(name)
     parts = path.parts
     causes = {
@@ -240,7 +245,7 @@ def unpack(archive: Path, folder: Path, limit_bytes: int, limit_files: int) -> t
 
 
 def most_bytes(archive: Path) -> int:
-    """Bytes that an archive of this size may hold."""
+    """Return the bytes that an archive of this size may hold."""
     return MOST_RATIO * archive.stat().st_size + FREE_BYTES
 
 

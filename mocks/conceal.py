@@ -38,8 +38,15 @@ class ConcealError(ValueError):
 
 
 def parse(specs: Iterable[str]) -> Concealed:
-    """Effects by side. Raises `ConcealError` that names the effect, the parameter or the limit, and what may be
-    chosen."""
+    """Return the effects that a bench conceals, by side.
+
+    specs : `SIDE:EFFECT[:PARAMETER=VALUE,...]` each; the side is left, right or both
+
+    Raises `ConcealError` that names the effect, the parameter or the limit, and what may be chosen.
+
+    >>> [effect.name for effect in parse(["left:defocus:defocus_um=10"])["left"]]
+    ['defocus']
+    """
     by_side: dict[Side, tuple[Effect, ...]] = {"left": (), "right": ()}
     for spec in specs:
         sides, effect = _parse(spec.strip())

@@ -158,7 +158,7 @@ class TriggerLine:
         self._devices.append(device)
 
     def pulse(self, source: U3vDevice, start_s: float) -> None:
-        """An exposure of `source` begins at virtual time `start_s`."""
+        """Tell the wired cameras that an exposure of `source` begins at virtual time `start_s`."""
         if not source.gives_pulses:
             return
         for device in self._devices:
@@ -500,7 +500,7 @@ class U3vDevice(UsbDevice):
             self._stream.clear()
 
     def line_pulse(self, start_s: float) -> None:
-        """A pulse on Line0 at virtual time `start_s`."""
+        """Take a pulse on Line0 at virtual time `start_s`."""
         control = self._get(TRIGGER_CONTROL)
         if control & TRIGGER_ON and self._trigger_source() == SOURCE_LINE:
             self._expose_now(start_s)

@@ -191,7 +191,7 @@ class GentlCamera(GenicamCamera):
 
     @staticmethod
     def enumerate_cameras() -> Iterator[tuple[str, str]]:
-        """(address, what it is) of every camera that the installed producers find."""
+        """Yield (address, what it is) of every camera that the installed producers find."""
         _library()
         for producer in _producers(None):
             yield from producer.cameras()

@@ -179,9 +179,13 @@ _at_start: list[Rescue] = []
 
 
 def make_safe_at_start(arguments: Sequence[str]) -> None:
-    """What `calibench serve ARGUMENTS` does first: have the stations of its data folder's sessions that ended by a
-    crash made safe, and say when they are. While the instruments answer, the service may be loaded;
-    `made_safe_at_start` waits for them."""
+    """Make the stations safe whose sessions ended by a crash, and report when they are: what `calibench serve` does
+    first.
+
+    arguments : of `calibench serve`, for the data folder
+
+    While the instruments answer, the service may be loaded; `wait_until_safe_at_start` waits for them.
+    """
     if "CALIBENCH_DATABASE_URL" in os.environ:
         return
     data = os.environ.get("CALIBENCH_DATA", "calibench-data")

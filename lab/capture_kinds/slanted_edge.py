@@ -81,8 +81,18 @@ class TurnTarget(Adjustment):
 
 
 def turn_layout(region: EdgeLayout, turn_deg: float, rows: int, cols: int) -> EdgeLayout | None:
-    """Return where an edge lies in a frame of `rows` x `cols` after its holder was turned by `turn_deg` about the
-    middle of the frame; None: no longer whole in the frame. Its angle stays within -45 to 135 deg."""
+    """Return where an edge lies in a frame after its holder was turned about the middle of the frame.
+
+    region : where it lies before
+    turn_deg : positive takes the top of the edge to the right; the angle stays within -45 to 135 deg
+    rows, cols : of the frame, px
+
+    Returns None where the region is no longer whole in the frame.
+
+    >>> edge = EdgeLayout(name="top", region=(0, 40, 20, 60), angle_deg=5.0, field_mm=(0.0, 0.0))
+    >>> turn_layout(edge, 90.0, 100, 100).region
+    (40, 80, 60, 100)
+    """
     turn = math.radians(turn_deg)
     row0, col0, row1, col1 = region.region
     at_row, at_col = _turn_place(0.5 * (row0 + row1 - rows), 0.5 * (col0 + col1 - cols), turn)

@@ -111,10 +111,21 @@ class ComparedNumbers:
 def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RATE) -> ComparisonResult:
     """Compare two fits of one rig, number by number.
 
-    `false_alarm_rate`: probability of any `changed` between two calibrations of an unchanged rig. It is shared among
-    the n rows of the comparison (Sidak): each is `changed` beyond z sigma with 2 (1 - Phi(z)) = 1 - (1 - rate)^(1/n),
-    4.1 for the 239 rows of a session with eight edges, 4.4 for 1000. Rows are taken as independent. They are not; the
-    true rate is lower. `tests/recovery/test_compare_coverage.py` measures it on 105 comparisons of an unchanged camera.
+    a, b : the fits
+    false_alarm_rate : probability of any `changed` between two calibrations of an unchanged rig
+
+    The rate is shared among the n rows of the comparison (Sidak): each is `changed` beyond z sigma with
+    2 (1 - Phi(z)) = 1 - (1 - rate)^(1/n), 4.1 for the 239 rows of a session with eight edges, 4.4 for 1000. Rows are
+    taken as independent. They are not; the true rate is lower. `tests/recovery/test_compare_coverage.py` measures it on
+    105 comparisons of an unchanged camera.
+
+    >>> from lab.formats.results import CameraFit, NoiseFit
+    >>> def fitted(read_noise_e):
+    ...     noise = NoiseFit(read_noise_e=read_noise_e, read_noise_e_std=0.05)
+    ...     return FitResult(source="my-camera", cameras={"left": CameraFit(noise=noise)})
+    >>> change = compare(fitted(2.0), fitted(3.0)).changes[0]
+    >>> round(change.significance_sigma, 1), change.changed  # 1 / (0.05 sqrt(2))
+    (14.1, True)
     """
     skipped: list[Skipped] = []
     rows: list[Change] = []
@@ -185,12 +196,26 @@ def _without_temperature(a: CameraFit, b: CameraFit, side: Side) -> Iterator[Ski
 
 
 def sigma_of_probability(p_value: float) -> float:
-    """Express a probability as standard deviations of a normal distribution, two-sided."""
+    """Express a probability as standard deviations of a normal distribution, two-sided.
+
+    p_value : probability, 0..1
+
+    >>> round(sigma_of_probability(0.0027), 2)
+    3.0
+    """
     return -float(special.ndtri(max(p_value, 1e-300) / 2.0))
 
 
 def sidak_part(rate: float, number: int) -> float:
-    """Return the probability allowed for each of `number` tests, so that any of them has `rate` (Sidak)."""
+    """Return the probability allowed for each of `number` independent tests, so that any of them has `rate` (Sidak).
+
+    rate : probability that one or more of the tests fail by chance, 0..1
+    number : how many tests
+
+    >>> each = sidak_part(0.01, 200)
+    >>> round(1.0 - (1.0 - each) ** 200, 6)
+    0.01
+    """
     return float(-np.expm1(np.log1p(-rate) / max(number, 1)))
 
 

@@ -191,7 +191,15 @@ def _imaging(
 
 
 def lens_cache() -> Path:
-    """Folder where traced lenses' tables are kept: CALIBENCH_CACHE, else the platform's own place for such files."""
+    """Return the folder where traced lenses' tables are kept: CALIBENCH_CACHE, else the platform's own place for such
+    files.
+
+    >>> import os
+    >>> os.environ["CALIBENCH_CACHE"] = "/data/lenses"
+    >>> lens_cache()
+    PosixPath('/data/lenses')
+    >>> del os.environ["CALIBENCH_CACHE"]
+    """
     if "CALIBENCH_CACHE" in os.environ:
         return Path(os.environ["CALIBENCH_CACHE"])
     if sys.platform == "win32":
@@ -303,8 +311,18 @@ def _first(error: Exception) -> str:
 def write_camera(file: Path, content: CameraFile) -> None:
     """Write a camera file that `read_camera` reads back to exactly the same camera.
 
+    file : TOML, to be written
+    content : the camera, its effects and its lens
+
     Measured point-spread and transfer functions go into an .npz file beside it; so does the table of a traced lens
     without a prescription.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "left.toml"
+    ...     write_camera(file, default_camera())
+    ...     read_camera(file).camera == default_camera().camera
+    True
     """
     text = "\n".join(_lines(file, content)) + "\n"
     with replacing(file) as partial:
@@ -406,7 +424,11 @@ def _parameters(model: BaseModel, skip: Sequence[str] = ()) -> Iterator[str]:
 
 
 def describe_quantity(quantity: Quantity) -> str:
-    """Unit, meaning and bounds of a parameter, as they stand in the file's comments and in the documentation."""
+    """Return unit, meaning and bounds of a parameter, as they stand in the file's comments and in the documentation.
+
+    >>> describe_quantity(read_quantities(CameraModel)["read_noise_e"]).startswith("e")
+    True
+    """
     bounds = ["" if limit is None else f"{limit:g}" for limit in (quantity.lower, quantity.upper)]
     limits = f" ({bounds[0]} .. {bounds[1]})".replace("( ..", "(..").replace(".. )", "..)") if any(bounds) else ""
     return f"{quantity.unit}: {quantity.meaning}{limits}"
@@ -443,6 +465,11 @@ def default_camera() -> CameraFile:
 
     Its values are like those of data sheets of 1/3 inch sensors. Its curves, with an infrared-cut filter at 650 nm,
     have typical shapes and are of no particular maker.
+
+    >>> import calibench
+    >>> camera = calibench.default_camera().camera
+    >>> camera.rows, camera.cols, camera.cfa, camera.bit_depth
+    (960, 1280, 'RGGB', 12)
     """
     wavelength_nm = np.arange(380.0, 721.0, 10.0)
 

@@ -70,9 +70,17 @@ class ForeignText:
 
 
 def read_foreign_text(file: Path) -> ForeignText:
-    """Return the text of `file`: UTF-8, UTF-16 by its byte-order mark or its zeros, else Latin-1 (Windows-1252).
+    r"""Return the text of a file: UTF-8, UTF-16 by its byte-order mark or its zeros, else Latin-1 (Windows-1252).
 
-    Raises InputError, without the path, where the file can't be read or holds no text.
+    Returns the text with remarks on what was converted. Raises InputError, without the path, where the file can't be
+    read or holds no text.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "light.csv"
+    ...     _ = file.write_bytes("wavelength_nm,value\r\n400,0.5\r\n".encode("utf-16"))
+    ...     read_foreign_text(file).text.splitlines()
+    ['wavelength_nm,value', '400,0.5']
     """
     try:
         data = file.read_bytes()
@@ -115,8 +123,16 @@ def remarks_on(folder: Path, names: Iterable[str]) -> list[str]:
 
 
 def read_foreign_csv(file: Path) -> ForeignText:
-    """Return the table in `file` with commas between cells and decimal points, line for line. Raises InputError without
-    the path.
+    r"""Return the table in `file` with commas between cells and decimal points, line for line, and remarks.
+
+    Raises InputError without the path.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "light.csv"
+    ...     _ = file.write_text("wavelength_nm;value\n400;0,5\n")
+    ...     read_foreign_csv(file).text
+    'wavelength_nm,value\n400,0.5\n'
     """
     table = read_foreign_text(file)
     text, remarks = plain_csv(table.text)
@@ -124,10 +140,15 @@ def read_foreign_csv(file: Path) -> ForeignText:
 
 
 def plain_csv(text: str) -> tuple[str, tuple[str, ...]]:
-    """Return a table with semicolons or tabs as one with commas; decimal commas become points. What has commas in its
-    first line stays as it is.
+    r"""Bring a table with semicolons or tabs to commas between cells and decimal points.
 
-    Raises InputError where numbers of both kinds stand in it, or where a comma may separate decimals or thousands.
+    text : the table; what has commas in its first line stays as it is
+
+    Returns the table and remarks on what was changed. Raises InputError where numbers of both kinds stand in it, or
+    where a comma may separate decimals or thousands.
+
+    >>> plain_csv("wavelength_nm;value\n400;0,5\n")
+    ('wavelength_nm,value\n400,0.5\n', ('read with semicolons between cells and decimal commas',))
     """
     lines = text.splitlines()
     head = next((line for line in lines if line.strip()), "")
@@ -149,9 +170,14 @@ def plain_csv(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def has_decimal_commas(words: Sequence[tuple[int, str]]) -> bool:
-    """Return whether the numbers among the words of a table, each with its row, have decimal commas.
+    """Return whether the numbers of a table have decimal commas.
+
+    words : (row, word) of each word of the table
 
     Raises InputError where numbers of both kinds stand in it, or where a comma may separate decimals or thousands.
+
+    >>> has_decimal_commas([(2, "400"), (2, "0,5")])
+    True
     """
     commas = [word for word in words if COMMA_NUMBER.fullmatch(word[1])]
     points = [word for word in words if POINT_NUMBER.fullmatch(word[1])]
@@ -177,7 +203,13 @@ def _with_points(cell: str) -> str:
 
 def nearest_name(name: str, known: Iterable[str]) -> str | None:
     """Return the known name that `name` is probably meant to be: the same with another unit, its beginning, or a
-    misspelling of it. None: there is none.
+    misspelling of it; None where there is none.
+
+    name : as somebody wrote it
+    known : names that there are
+
+    >>> nearest_name("exposure_ms", ["frame", "exposure_s"])
+    'exposure_s'
     """
     names = list(known)
     asked = re.sub(r"[^a-z0-9.]+", "_", name.lower()).strip("_")
@@ -193,7 +225,11 @@ def nearest_name(name: str, known: Iterable[str]) -> str | None:
 
 
 def in_its_unit(name: str) -> str:
-    """Return a name with the unit of its ending in words: `exposure_s, in seconds`."""
+    """Return a name with the unit of its ending in words.
+
+    >>> in_its_unit("exposure_s")
+    'exposure_s, in seconds'
+    """
     unit = next((words for ending, words in UNITS.items() if name.endswith(f"_{ending}")), None)
     return f"{name}, in {unit}" if unit else name
 
@@ -225,8 +261,19 @@ class TableRow:
 
 
 def table_rows(file: Path, needed: Sequence[str], known: Sequence[str]) -> list[TableRow]:
-    """Return the rows of `file`, which has the columns `needed` and no others than `known`. Raises InputError with one
-    line.
+    r"""Return the rows of a table.
+
+    file : CSV in any of the forms that `plain_csv` knows
+    needed, known : columns that it must have, and those that it may have
+
+    Raises InputError with one line for an unknown or a missing column.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "levels.csv"
+    ...     _ = file.write_text("exposure_s,mean_dn\n0.01,100\n")
+    ...     table_rows(file, ["exposure_s"], ["exposure_s", "mean_dn"])[0].value("mean_dn")
+    100.0
     """
     try:
         reader = csv.reader(read_foreign_csv(file).text.splitlines())
@@ -290,7 +337,11 @@ class CgatsSpectra:
 
 
 def get_quantity(name: str) -> Quantity:
-    """Return the quantity of that name. Raises InputError for another."""
+    """Return the quantity of a name, as a type checker knows it. Raises InputError for another.
+
+    >>> get_quantity("radiance")
+    'radiance'
+    """
     for known in _WRITTEN:
         if name == known:
             return known
@@ -311,10 +362,25 @@ def read_cgats(file: Path) -> CgatsSpectra:
 
 
 def parse_cgats(text: str) -> CgatsSpectra:
-    """Return the spectra in CGATS text. Its InputError leaves the path to the caller.
+    """Return the spectra in CGATS text.
 
     A spectrum has its SAMPLE_NAME where these differ, else its SAMPLE_ID, or both; of several tables, the table's
-    condition or number before it where the names don't differ.
+    condition or number before it where the names don't differ. Raises InputError without the path, which the caller
+    knows.
+
+    >>> text = '''CGATS.17
+    ... SPECTRAL_BANDS "2"
+    ... SPECTRAL_START_NM "400"
+    ... SPECTRAL_END_NM "500"
+    ... BEGIN_DATA_FORMAT
+    ... SAMPLE_ID SPEC_400 SPEC_500
+    ... END_DATA_FORMAT
+    ... BEGIN_DATA
+    ... white 0.25 0.5
+    ... END_DATA
+    ... '''
+    >>> parse_cgats(text).spectra["white"].value
+    (0.25, 0.5)
     """
     tables = _tables(text)
     remarks: list[str] = []
@@ -530,10 +596,21 @@ def _number(text: str, what: str) -> float:
 
 
 def write_cgats(file: Path, content: CgatsSpectra) -> tuple[str, ...]:
-    """Write spectra as `.ti3` where the name ends so, else as `.sp`. Returns what was changed for the format.
+    """Write spectra as `.ti3` where the name ends so, else as `.sp`.
 
-    All spectra get one grid of even steps, the finest of them, as the format has no other. Raises InputError where that
-    has more bands than Argyll reads, or the quantity isn't stated.
+    file : to be written
+    content : spectra by name, and their quantity
+
+    All spectra get one grid of even steps, the finest of them, as the format has no other. Returns what was changed for
+    the format. Raises InputError where that has more bands than Argyll reads, or the quantity isn't stated.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> white = Spectrum(wavelength_nm=(400.0, 500.0, 600.0), value=(0.25, 0.5, 1.0))
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "white.sp"
+    ...     _ = write_cgats(file, CgatsSpectra({"white": white}, "radiance"))
+    ...     [spectrum.wavelength_nm for spectrum in read_cgats(file).spectra.values()]
+    [(400.0, 500.0, 600.0)]
     """
     if content.quantity is None:
         raise InputError(f"{file}: the quantity isn't stated; give one of {', '.join(_WRITTEN)}")

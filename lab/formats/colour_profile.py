@@ -39,7 +39,13 @@ def _of_colour(camera: CameraModel, file: Path) -> CameraModel:
 
 
 def energy_sensitivities(camera: CameraModel) -> FloatArray:
-    """Sensitivity to energy of R, G, B (columns) at `GRID_NM` (rows), efficiency x wavelength, the highest 1."""
+    """Return the sensitivity to energy of R, G, B (columns) at `GRID_NM` (rows): efficiency x wavelength, the highest
+    1.
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> float(energy_sensitivities(default_camera().camera).max())
+    1.0
+    """
     curves = np.stack([camera.quantum_efficiency[channel].at(GRID_NM) * GRID_NM for channel in CHANNELS], axis=1)
     return np.asarray(curves / curves.max())
 
@@ -77,10 +83,18 @@ def write_rawtoaces(file: Path, content: CameraFile) -> tuple[str, ...]:
 
 
 def colour_matrices(camera: CameraModel, light: str) -> tuple[FloatArray, FloatArray]:
-    """(ColorMatrix, ForwardMatrix), 3 x 3 each, of a camera under an illuminant of colour-science's.
+    """Return (ColorMatrix, ForwardMatrix), 3 x 3 each, of a camera under an illuminant.
+
+    camera : with quantum efficiencies of R, G, B
+    light : name of an illuminant of colour-science
 
     ColorMatrix: XYZ under that light (white of Y = 1) to the camera's own signals, the greatest of white 1.
-    ForwardMatrix: signals divided by white's to XYZ under D50. White is kept exactly by both.
+    ForwardMatrix: signals divided by white's to XYZ under D50. White is kept exactly by both (DNG 1.7.1, chapter 6).
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> colour, forward = colour_matrices(default_camera().camera, "D65")
+    >>> (forward @ np.ones(3)).round(3).tolist()  # XYZ of D50
+    [0.964, 1.0, 0.825]
     """
     colour = colour_science()
     sensitivity = energy_sensitivities(camera)

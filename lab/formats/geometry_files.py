@@ -84,7 +84,12 @@ def pair_cameras(left: CameraFile, right: CameraFile, stereo: StereoFit) -> tupl
 
 
 def geometry_of(camera: CameraModel) -> Geometry:
-    """Return the camera's geometry, or the pinhole that its focal length and pitch give."""
+    """Return the camera's geometry, or the pinhole that its focal length and pitch give.
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> round(geometry_of(default_camera().camera).camera_matrix[0][0], 1)  # 8 mm / 3.45 um
+    2318.8
+    """
     if camera.geometry is not None:
         return camera.geometry
     f = camera.lens.known_focal_length_mm * 1e3 / camera.pixel_pitch_um
@@ -225,9 +230,21 @@ def _yaml(document: Mapping[str, Any]) -> str:
 
 
 def write_opencv(file: Path, content: CameraFile, pair: Pair | None = None) -> tuple[str, ...]:
-    """Write OpenCV's FileStorage: YAML, XML or JSON by the ending. Returns what it has no place for; raises InputError.
+    """Write OpenCV's FileStorage: YAML, XML or JSON by the ending.
 
-    A pair has the keys M1, D1, M2, D2, R, T (mm), and R1, R2, P1, P2, Q where the fit has a rectification.
+    file : to be written
+    content : the camera, of a pair the left one
+    pair : the right camera and the pose; then the keys are M1, D1, M2, D2, R, T (mm), and R1, R2, P1, P2, Q where the
+        fit has a rectification
+
+    Returns what the format has no place for. Raises InputError for another ending.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> from lab.formats.camera_file import default_camera
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = write_opencv(Path(folder) / "left.json", default_camera())
+    ...     "camera_matrix" in (Path(folder) / "left.json").read_text()
+    True
     """
     import cv2
 

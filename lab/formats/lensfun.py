@@ -208,10 +208,22 @@ def _pa(camera: CameraModel, effects: Sequence[Effect]) -> tuple[tuple[float, fl
 
 
 def read_lensfun(file: Path, camera: CameraModel, model: str = "") -> LensfunLens:
-    """Return the lens `model` of a lensfun file, or its only one, at the focal length and the aperture of a camera.
+    """Return a lens of a lensfun file at the focal length and the aperture of a camera.
+
+    file : XML of lensfun's database
+    camera : before which the lens is
+    model : name of the lens; by default the file's only one
 
     Raises InputError, one line that begins with the file: it isn't lensfun's, or holds several lenses or not this one,
     or this one isn't calibrated for such a camera.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> from lab.formats.camera_file import default_camera
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "lens.xml"
+    ...     _ = write_lensfun(file, default_camera())
+    ...     read_lensfun(file, default_camera().camera).focal_length_mm
+    8.0
     """
     try:
         if file.stat().st_size > MOST_BYTES:

@@ -106,8 +106,9 @@ class ModelPosterior(Frozen):
         )
 
     def select(self, names: list[str]) -> tuple[FloatArray, FloatArray]:
-        """Mean (n,) and covariance (n, n) of the parameters `names`. One that isn't known here has its prior: mean 0,
-        variance 1."""
+        """Return mean (n,) and covariance (n, n) of the parameters `names`. One that isn't known here has its prior:
+        mean 0, variance 1.
+        """
         known = {name: i for i, name in enumerate(self.names)}
         mean, covariance = np.zeros(len(names)), np.eye(len(names))
         at = [i for i, name in enumerate(names) if name in known]

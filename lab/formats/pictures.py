@@ -260,7 +260,14 @@ def _by_opencv(data: bytes, page: int = 0) -> NDArray[Any]:
 
 
 def png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes, bytes]]:
-    """Yield name, content and checksum of each chunk; the last may be cut off."""
+    """Yield name, content and checksum of each chunk; the last may be cut off.
+
+    data : the file's content, its signature included (Portable Network Graphics, W3C, section 5.3)
+
+    >>> head = PNG + (2).to_bytes(4, "big") + b"sBIT" + b"ab" + b"sum."
+    >>> list(png_chunks(head))
+    [(b'sBIT', b'ab', b'sum.')]
+    """
     at = len(PNG)
     while at + 8 <= len(data):
         length, name = struct.unpack(">I4s", data[at : at + 8])
@@ -270,7 +277,13 @@ def png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes, bytes]]:
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield marker and content of each segment up to the picture."""
+    """Yield marker and content of each segment up to the picture.
+
+    data : the file's content, from its first byte (ITU-T T.81, annex B)
+
+    >>> list(jpeg_segments(bytes([0xFF, 0xD8, 0xFF, 0xE1, 0, 4, 65, 66, 0xFF, 0xDA])))
+    [(225, b'AB')]
+    """
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
         if data[at + 1] == 0xFF:  # a fill byte

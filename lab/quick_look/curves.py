@@ -225,8 +225,13 @@ class GrowingCurves:
 
 
 def centre(frame: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Return the middle quarter of a frame, beginning at an even row and column, so that the mosaic stays what it
-    is."""
+    """Return the middle quarter of a frame, beginning at an even row and column, so that the mosaic stays what it is.
+
+    frame : (rows, cols) DN
+
+    >>> centre(np.zeros((480, 640), np.uint16)).shape
+    (240, 320)
+    """
     rows, cols = frame.shape
     row, col = rows // 4 // 2 * 2, cols // 4 // 2 * 2
     return frame[row : rows - row, col : cols - col]

@@ -113,7 +113,13 @@ def effect_line(effect: NamedEffect) -> str:
 
 
 def list_findings(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
-    """Sentences: implausible figures, the named effects, mismatches without a name, and cameras without a mismatch."""
+    """Yield sentences on implausible figures, the named effects, mismatches without a name, and cameras without a
+    mismatch.
+
+    >>> fit = FitResult(source="my-camera", cameras={}, warnings=("the read noise of 0.001 e is implausible",))
+    >>> any("0.001 e" in sentence for sentence in list_findings(fit, None))
+    True
+    """
     yield from (f"Warning: {line}." for line in fit.warnings)
     if diagnosis is None:
         return
@@ -158,7 +164,7 @@ def _sure_of(effect: NamedEffect) -> str:
 
 
 def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
-    """Sentences: probabilities and rivals, chi2 on held-out captures, and the false-alarm rate."""
+    """Yield sentences on probabilities and rivals, chi2 on held-out captures, and the false-alarm rate."""
     if diagnosis is None:
         yield "The fits' own standard deviations; nothing was compared with a model."
         return
@@ -225,7 +231,7 @@ def _worst(checks: Iterable[Check]) -> dict[Side, list[Check]]:
 def to_do(
     diagnosis: DiagnosisResult | None, left_out: int, warnings: int, implausible: Sequence[str] = ()
 ) -> Iterator[str]:
-    """Sentences: the next capture, what to check, and which model to predict with."""
+    """Yield sentences on the next capture, what to check, and which model to predict with."""
     if implausible:
         yield "Settle the warnings about figures first: what depends on a wrong statement is wrong, too."
     if diagnosis is None:
@@ -252,8 +258,9 @@ def _rms_residual(values: Sequence[float], curve: ResidualCurve) -> float:
 
 
 def proof_curves(diagnosis: DiagnosisResult) -> list[ResidualCurve]:
-    """For each of the first two named effects, the measurement that shows it most, where the baseline fits worst; then
-    the measurements that it fits worst. None where nothing was named."""
+    """Return, for each of the first two named effects, the measurement that shows it most, where the baseline fits
+    worst; then the measurements that it fits worst. None where nothing was named.
+    """
     if not diagnosis.effects:
         return []
     curves = [curve for curve in diagnosis.curves if len(curve.x) > 3]
@@ -268,7 +275,7 @@ def proof_curves(diagnosis: DiagnosisResult) -> list[ResidualCurve]:
 
 
 def proof_words(curve: ResidualCurve) -> tuple[str, str]:
-    """Title and caption of such a measurement."""
+    """Return the title and caption of such a measurement."""
     before, after = _rms_residual(curve.before, curve), _rms_residual(curve.after, curve)
     title = measurement_title(curve.measurement)
     caption = (
@@ -361,7 +368,7 @@ def context(
     warnings: int,
     both: BothModels | None = None,
 ) -> dict[str, Any]:
-    """Variables of `answers.html`."""
+    """Return the variables of `answers.html`."""
     badge, mood, headline = words.headline(diagnosis)
     return {
         "badge": badge,

@@ -56,7 +56,11 @@ def _fade(colour: str, opacity: float = FADED) -> str:
 
 
 def axis(title: str, **more: Any) -> dict[str, Any]:
-    """Return a labelled axis in the report's style."""
+    """Return a labelled axis in the report's style; `more`: further keys of Plotly's axis.
+
+    >>> axis("signal, DN", rangemode="tozero")["title"]["text"]
+    'signal, DN'
+    """
     return {
         "title": {"text": title, "standoff": 6},
         "gridcolor": "@grid",
@@ -71,8 +75,13 @@ def axis(title: str, **more: Any) -> dict[str, Any]:
 
 
 def log_axis(title: str, values: Iterable[float], **more: Any) -> dict[str, Any]:
-    """Return a logarithmic axis that holds `values`, with whole numbers at its ticks: 1, 2, 5, 10, 20, ... within
-    `FEW_DECADES`, powers of ten beyond. Values of 0 or below have no place on it."""
+    """Return a logarithmic axis that holds `values`; those of 0 or below have no place on it.
+
+    Its ticks are whole numbers: 1, 2, 5, 10, 20, ... within `FEW_DECADES`, powers of ten beyond.
+
+    >>> log_axis("exposure, s", [0.01, 0.1])["ticktext"]
+    ['0.01', '0.02', '0.05', '0.1']
+    """
     exponents = [math.log10(value) for value in values if value is not None and 0.0 < value < math.inf]
     low, high = (min(exponents), max(exponents)) if exponents else (0.0, 1.0)
     margin = max(LOG_MARGIN * (high - low), 0.05)
@@ -91,7 +100,14 @@ def log_axis(title: str, values: Iterable[float], **more: Any) -> dict[str, Any]
 
 
 def layout(height: int, **more: Any) -> dict[str, Any]:
-    """Return a figure's layout in the report's style."""
+    """Return a figure's layout in the report's style.
+
+    height : px
+    more : further keys of Plotly's layout
+
+    >>> layout(300)["height"]
+    300
+    """
     return {
         "height": height,
         "margin": {"l": 56, "r": 14, "t": 26, "b": 44},
@@ -104,13 +120,28 @@ def layout(height: int, **more: Any) -> dict[str, Any]:
 
 
 def error_bars(std: Sequence[float | None], colour: str) -> dict[str, Any]:
+    """Return error bars of one standard deviation to each side, in a colour.
+
+    std : one for each point; None: none
+
+    >>> error_bars([0.5, None], "#d1495b")["array"]
+    [0.5, None]
+    """
     return {"type": "data", "array": list(std), "color": colour, "thickness": 1, "width": 2}
 
 
 def band(
     x: Sequence[float], centre: np.ndarray[Any, Any], half: np.ndarray[Any, Any], colour: str, **more: Any
 ) -> Trace:
-    """Return a filled band centre +- half."""
+    """Return a filled band centre +- half.
+
+    x : (n,)
+    centre, half : (n,), in one unit
+    more : further keys of the trace
+
+    >>> band([1.0, 2.0], np.array([5.0, 6.0]), np.array([0.5, 0.5]), "#d1495b")["y"]
+    [5.5, 6.5, 5.5, 4.5]
+    """
     return {
         "type": "scatter",
         "x": [*x, *reversed(list(x))],
@@ -124,7 +155,7 @@ def band(
 
 
 def photon_transfer(noise: NoiseFit) -> Figure | None:
-    """Temporal variance against signal, with the line of the fitted conversion gain."""
+    """Draw temporal variance against signal, with the line of the fitted conversion gain."""
     if noise.photon_transfer is None:
         return None
     return photon_transfer_points(
@@ -177,8 +208,9 @@ def photon_transfer_points(points: PhotonTransfer, gain: float | None = None, ga
 
 
 def repeat_drift(drift: RepeatDrift) -> Figure:
-    """Means of repeats over time, with the fitted curve where it changes and its standard uncertainty, DN; of several
-    settings in common, departures from each setting's mean."""
+    """Draw the means of repeats over time, with the fitted curve where it changes and its standard uncertainty, DN; of
+    several settings in common, departures from each setting's mean.
+    """
     curve, half = np.array(drift.curve_dn), np.array(drift.curve_dn_std)
     abscissa = "elapsed time, s" if drift.elapsed_s is not None else "number of the repeat"
     x = list(drift.elapsed_s) if drift.elapsed_s is not None else [float(k + 1) for k in range(len(curve))]
@@ -209,7 +241,7 @@ def repeat_drift(drift: RepeatDrift) -> Figure:
 
 
 def linearity(noise: NoiseFit) -> Figure | None:
-    """Deviation from the straight line of the response, per cent of the line."""
+    """Draw the deviation from the straight line of the response, per cent of the line."""
     points = noise.photon_transfer
     if points is None:
         return None
@@ -411,7 +443,9 @@ def overlay_validated(checks: Sequence[tuple[Check, Check | None]]) -> dict[str,
 
 
 def overlay_explained(curves: Sequence[ResidualCurve], measurement: str = "slanted_edge") -> dict[str, list[Overlay]]:
-    """Panel title -> curves of one measurement from the diagnosis; where a curve exists twice, the held-out one."""
+    """Return the curves of one measurement from the diagnosis, by panel title; where a curve exists twice, the held-out
+    one.
+    """
     chosen: dict[tuple[str, str], ResidualCurve] = {}
     for curve in curves:
         key = (curve.label, curve.channel)
@@ -434,8 +468,9 @@ def _legend(name: str, **look: Any) -> Trace:
 def transfer_overlays(
     panels: Mapping[str, Sequence[Overlay]], columns: int = 3, model: str = "baseline"
 ) -> Figure | None:
-    """Measured MTF (points), the baseline's prediction (dashed), and the improved model's (solid) where effects were
-    named."""
+    """Draw measured MTF (points), the baseline's prediction (dashed), and the improved model's (solid) where effects
+    were named.
+    """
     if not panels:
         return None
     columns = min(columns, len(panels))
@@ -600,7 +635,7 @@ def patch_comparison(patches: Sequence[PatchComparison], improved: Sequence[Patc
 
 
 def mismatch_map(diagnosis: DiagnosisResult) -> Figure | None:
-    """Significance of the baseline's mismatches by axis, one row for each side and measurement."""
+    """Draw the significance of the baseline's mismatches by axis, one row for each side and measurement."""
     if not diagnosis.mismatches:
         return None
     rows = list(dict.fromkeys((item.side, item.measurement) for item in diagnosis.mismatches))
@@ -677,7 +712,14 @@ def _residual_traces(name: str, x: Sequence[float], residual: np.ndarray[Any, An
 
 
 def beyond_axis(name: str, residual: np.ndarray[Any, Any]) -> str:
-    """Return how many residuals lie beyond the axis, and the farthest; empty where none does."""
+    """Return how many residuals lie beyond the axis, and the farthest; empty where none does.
+
+    name : of the measurement
+    residual : (n,), standard deviations
+
+    >>> beyond_axis("MTF", np.array([0.5, -1.0]))
+    ''
+    """
     beyond = np.abs(residual) > RESIDUAL_SIGMA
     if not beyond.any():
         return ""
@@ -710,7 +752,7 @@ def _beside_residuals(said: str, colour: str, place: int) -> dict[str, Any]:
 
 
 def residual_curve(curve: ResidualCurve) -> Figure:
-    """One measurement with both models' predictions, and below it the residuals in standard deviations."""
+    """Draw one measurement with both models' predictions, and below it the residuals in standard deviations."""
     std = np.maximum(np.asarray(curve.measured_std), 1e-12)
     seen = np.asarray(curve.measured)
     notes: list[dict[str, Any]] = []
@@ -779,7 +821,7 @@ def residual_curve(curve: ResidualCurve) -> Figure:
 
 
 def held_out_bars(diagnosis: DiagnosisResult) -> Figure | None:
-    """chi2 / n of both models on held-out captures; noise alone gives 1."""
+    """Draw chi2 / n of both models on held-out captures; noise alone gives 1."""
     held = diagnosis.held_out
     if held is None or held.n == 0:
         return None
@@ -849,8 +891,9 @@ class ChartData:
         return len(self._lines) - 1
 
     def pack(self) -> str:
-        """All figures, a line of JSON each, compressed, as base64: no text of theirs can end the element that holds
-        it."""
+        """Return all figures, a line of JSON each, compressed, as base64: no text of theirs can end the element that
+        holds it.
+        """
         return base64.b64encode(gzip.compress("\n".join(self._lines).encode(), mtime=0)).decode("ascii")
 
 

@@ -30,7 +30,7 @@ def most_significant(comparison: ComparisonResult) -> tuple[Change, ...]:
 
 
 def significances(comparison: ComparisonResult) -> Figure | None:
-    """Significance of each difference in standard deviations, with the limit of the stated false-alarm rate."""
+    """Draw the significance of each difference in standard deviations, and the limit of the stated false-alarm rate."""
     rows = most_significant(comparison)[::-1]
     if not rows:
         return None
@@ -67,7 +67,7 @@ def significances(comparison: ComparisonResult) -> Figure | None:
 
 
 def projection_vectors(item: ProjectionChange) -> Figure:
-    """Differences of projection over the frame as enlarged lines, from A to B."""
+    """Draw the differences of projection over the frame as enlarged lines, from A to B."""
     x, y = np.meshgrid(item.x_px, item.y_px)
     at = np.stack([x.ravel(), y.ravel()], axis=1)
     shape = (item.y_px[-1] + 1, item.x_px[-1] + 1)

@@ -47,7 +47,7 @@ DEEPEST_SIGMA = 12.0
 
 
 def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[str, Any]:
-    """Variables of `diagnosis.html` besides the result itself."""
+    """Return the variables of `diagnosis.html` besides the result itself."""
     if diagnosis is None:
         return {}
     threshold = diagnosis.threshold
@@ -156,7 +156,11 @@ def _cell_map(law: DiscoveredLaw) -> Figure:
 
 
 def mood(chi2: float, n: int) -> str:
-    """CSS class of a chi2's cell: marked above the 99.9 % quantile."""
+    """Return the CSS class of a chi2's cell: marked above the 99.9 % quantile of chi2 with n degrees of freedom.
+
+    >>> mood(200.0, 100), mood(100.0, 100)
+    ('open', '')
+    """
     return "open" if n and chi2 > special.chdtri(n, 1.0 - MARKED_QUANTILE) else ""
 
 
@@ -175,7 +179,7 @@ def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) ->
 
 
 def place_maps(diagnosis: DiagnosisResult, sides: Sequence[Side]) -> list[tuple[str, Figure]]:
-    """Heat maps of significance by measurement and axis, one for each side and model (baseline, and improved model
+    """Draw heat maps of significance by measurement and axis, one for each side and model (baseline, and improved model
     where effects were named)."""
     maps = []
     for side in sides:

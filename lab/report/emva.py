@@ -39,7 +39,11 @@ class EmvaPlot:
 
 
 def markers(name: str, x: Sequence[float], y: Sequence[float], colour: str, **more: Any) -> Trace:
-    """Return a trace of markers; `more`: further keys of the trace."""
+    """Return a trace of markers; `more`: further keys of the trace.
+
+    >>> markers("darks", [0.0, 1.0], [64.0, 64.5], "#888888")["mode"]
+    'markers'
+    """
     return {
         "type": "scatter",
         "mode": "markers",
@@ -51,7 +55,11 @@ def markers(name: str, x: Sequence[float], y: Sequence[float], colour: str, **mo
 
 
 def curve(name: str, x: Sequence[float], y: Sequence[float], colour: str, dash: str = "solid", **more: Any) -> Trace:
-    """Return a trace of lines; `more`: further keys of the trace."""
+    """Return a trace of lines; `more`: further keys of the trace.
+
+    >>> curve("K", [0.0, 1.0], [0.0, 0.4], "#888888", "dot")["line"]["dash"]
+    'dot'
+    """
     return {
         "type": "scatter",
         "mode": "lines",
@@ -63,7 +71,14 @@ def curve(name: str, x: Sequence[float], y: Sequence[float], colour: str, dash: 
 
 
 def values_along(data: Sequence[Trace], key: str) -> list[float]:
-    """Return the coordinates `key` (x, y) of all traces, and the ends of their error bars."""
+    """Return the coordinates of all traces along an axis, and the ends of their error bars.
+
+    data : traces
+    key : `x` or `y`
+
+    >>> values_along([{"x": [1.0], "y": [5.0], "error_y": {"array": [0.5]}}], "y")
+    [5.0, 4.5, 5.5]
+    """
     values = [float(value) for trace in data for value in trace[key]]
     for trace in data:
         std = trace.get(f"error_{key}", {}).get("array", [])
@@ -143,9 +158,17 @@ def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane:
 
 
 def spectrogram(image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (cycles/px) and rms amplitude along the rows of an image: the root of the mean power spectrum of its
-    rows, scaled so that a white pattern of standard deviation s has the amplitude s at every frequency. Frequency 0 is
-    left out."""
+    """Return frequencies (cycles/px) and rms amplitude along the rows of an image; frequency 0 is left out.
+
+    image : (rows, cols)
+
+    It is the root of the mean power spectrum of the rows, scaled so that a white pattern of standard deviation s has
+    the amplitude s at every frequency, as in the spectrograms of EMVA 1288.
+
+    >>> frequency, amplitude = spectrogram(np.random.default_rng(1).normal(0.0, 2.0, (500, 64)))
+    >>> bool(abs(np.sqrt(np.mean(amplitude[:-1] ** 2)) - 2.0) < 3.0 * 2.0 / np.sqrt(2.0 * 500 * 64))
+    True
+    """
     length = image.shape[1]
     power = np.mean(np.abs(np.fft.rfft(image - image.mean(), axis=1)) ** 2, axis=0) / length
     return np.asarray(np.fft.rfftfreq(length)[1:], float), np.asarray(np.sqrt(power[1:]), float)
@@ -508,7 +531,7 @@ def _dark_current(figures: Emva1288, colour: str) -> Iterator[EmvaPlot]:
 
 
 def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
-    """Plots of the joint fit: read noise of single pixels, dark current against temperature."""
+    """Yield the plots of the joint fit: read noise of single pixels, dark current against temperature."""
     spread = noise.read_noise_distribution
     if spread is not None:
         edges = np.array(spread.noise_e)

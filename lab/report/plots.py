@@ -128,7 +128,14 @@ def _on_white(value: Any) -> Any:
 
 @singledispatch
 def charts_of(result: object) -> Iterator[Chart]:
-    """Yield the charts of a result, the one that tells most first; none of what has no chart."""
+    """Yield the charts of a result, the one that tells most first; none of what has no chart.
+
+    result : of `calibench.fit`, `validate`, `diagnose`, `compare`, `predict`, `score` or `certify`
+
+    >>> import calibench
+    >>> list(calibench.charts_of(calibench.FitResult(source="my-camera", cameras={})))
+    []
+    """
     yield from ()
 
 

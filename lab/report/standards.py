@@ -104,7 +104,11 @@ class StandardSection:
 
 
 def file_name(standard: str) -> str:
-    """Return the name of a standard's page, without its ending."""
+    """Return the name of a standard's page, without its ending.
+
+    >>> file_name("ISO 12233:2023")
+    'iso-12233-2023'
+    """
     return re.sub(r"[^a-z0-9]+", "-", standard.lower()).strip("-")
 
 

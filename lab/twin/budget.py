@@ -136,7 +136,15 @@ USES: dict[str, Callable[[CameraModel, Effects, float], FloatArray]] = {
 
 
 def parse_uses(text: str) -> tuple[str, ...]:
-    """Return the uses of "MTF50, patches". Raises InputError for one that isn't known."""
+    """Return the uses that a list names, each once.
+
+    text : names with commas between, in any case
+
+    Raises InputError for one that isn't known.
+
+    >>> parse_uses("mtf50")
+    ('MTF50',)
+    """
     names = {name.lower(): name for name in USES}
     uses = [part.strip() for part in text.split(",") if part.strip()]
     unknown = [part for part in uses if part.lower() not in names]

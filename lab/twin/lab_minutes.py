@@ -65,7 +65,7 @@ class LabCapture:
 def lab_captures(
     content: CameraFile, first: FirstEstimates, station: Station, times: StepTimes
 ) -> Iterator[LabCapture]:
-    """Every sequence of the station whose numbers the model predicts, as a full and as a quick session takes it."""
+    """Yield every sequence of the station whose numbers the model predicts, as a full and as a quick session has it."""
     seen: set[str] = set()
     for is_quick in (False, True):
         for sequence in full_plan(station, is_quick).sequences:

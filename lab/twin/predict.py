@@ -398,8 +398,8 @@ def _hold_what_is_corrected(
 
 
 def correction_covariance(correction: ModelDiscrepancy, x: FloatArray) -> FloatArray:
-    """Covariance (n, n) of what a correction's factor is wrong by at places `x` (n,) of its axis: its factors scatter
-    from place to place, and drift, and both go on between and beyond them.
+    """Return the covariance (n, n) of what a correction's factor is wrong by at places `x` (n,) of its axis: its
+    factors scatter from place to place, and drift, and both go on between and beyond them.
 
     With g(d) half the mean squared difference of factors that are d apart, c + b d by least squares, and w (n, k) the
     weights by which the correction is drawn through its k factors, the error f - w f_k has the covariance

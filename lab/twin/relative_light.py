@@ -47,7 +47,7 @@ class RelativeLight:
     covariance: FloatArray
 
     def dn_per_dose(self) -> float:
-        """Rate of the brightest lamp and channel, DN."""
+        """Return the rate of the brightest lamp and channel, DN."""
         return max(base * (1.0 + RATE_STD * z) for base, z in zip(self.per_dose.values(), self.value, strict=True))
 
     def about(self, per_dose: Mapping[str, float]) -> RelativeLight:
@@ -101,7 +101,7 @@ def relative_light(dataset: Dataset, effects: Effects, posterior: ModelPosterior
 
 
 def rates_per_dose(dataset: Dataset, block: Observable) -> dict[str, float]:
-    """DN for a unit of dose, in the baseline's linear response, by the name of each rate."""
+    """Return DN for a unit of dose, in the baseline's linear response, by the name of each rate."""
     dose = doses(dataset, block)
     rates = {}
     for name, column in block.predict(()).jacobian.items():
@@ -112,7 +112,7 @@ def rates_per_dose(dataset: Dataset, block: Observable) -> dict[str, float]:
 
 
 def doses(dataset: Dataset, block: Observable) -> FloatArray:
-    """Dose (n,) of the flats' means: photons a pixel, or electrons by the stated radiance and curves."""
+    """Return the dose (n,) of the flats' means: photons a pixel, or electrons by the stated radiance and curves."""
     dose = []
     for label in block.labels:
         capture = dataset.recordings.capture(label.captures[0])

@@ -160,7 +160,9 @@ def conclusion(effects: Sequence[TestedEffect]) -> str:
 
 @one_blas_thread
 def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
-    """Predicted beside measured. Raises InputError where the recordings aren't of the session that was predicted."""
+    """Compare a sealed prediction with the measured session. Raises InputError where the recordings aren't of the
+    session that was predicted.
+    """
     for side, prediction in sealed.sides.items():
         check_session(prediction, recordings, side)
     numbers: list[ScoredNumber] = []
@@ -413,5 +415,9 @@ def _quantity(name: str, numbers: list[ScoredNumber], value: float) -> QuantityS
 
 
 def title(quantity: str) -> str:
-    """Return a quantity as a lab reads it."""
+    """Return the name of a predicted quantity in words.
+
+    >>> title("slanted_edge")
+    'transfer function of slanted edges'
+    """
     return measurement_title(quantity)

@@ -104,7 +104,11 @@ class SealedPrediction(Tabular, Frozen):
 
 
 def seal_path(file: Path) -> Path:
-    """Return the file that holds the hash of `file`."""
+    """Return the file beside a sealed one that holds its SHA-256.
+
+    >>> seal_path(Path("prediction.json")).name
+    'prediction.json.sha256'
+    """
     return file.with_name(file.name + ".sha256")
 
 

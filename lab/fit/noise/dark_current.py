@@ -45,8 +45,8 @@ class SensorTemperature(Frozen):
         return "at an unknown temperature" if self.temperature_c is None else f"at {self.temperature_c:.1f} °C"
 
     def doublings(self, reference: SensorTemperature) -> tuple[float, float]:
-        """By how many times 2 a dark current at the reference's temperature is larger than at this one, and the
-        standard deviation.
+        """Return by how many doublings a dark current at the reference's temperature is larger than at this one, and
+        the standard deviation.
 
         The doubling temperature is the better known of both. Where a temperature isn't known, the number is 0 and its
         standard deviation that of the temperatures that a laboratory's sensors have.
@@ -61,13 +61,21 @@ class SensorTemperature(Frozen):
 
 
 def temperature_law(rates: Sequence[tuple[float, float, float]], gain_error: float = 0.0) -> DarkCurrentLaws:
-    """Return the Arrhenius law and the doubling temperature of EMVA 1288 through dark currents `rates`: (deg C, e/s,
-    its standard deviation).
+    """Fit the Arrhenius law and the doubling temperature of EMVA 1288 to dark currents.
 
         ln I = ln I_ref - E / k (1/T - 1/T_ref),    ln I = a + ln 2 (T - T_ref) / T_d
 
-    Weighted lines, T_ref the coldest temperature. Only currents above three standard deviations are used; two
-    temperatures are needed. `gain_error`: relative error of the gain, common to all.
+    Weighted lines, T_ref the coldest temperature.
+
+    rates : (temperature in deg C, dark current in e/s, its standard deviation) of each measurement; only currents above
+        three standard deviations are used, at two temperatures or more
+    gain_error : relative error of the gain, common to all
+
+    Returns the measurements alone where fewer than two temperatures have a significant current.
+
+    >>> law = temperature_law([(20.0, 10.0, 0.1), (27.0, 20.0, 0.1), (34.0, 40.0, 0.1)])
+    >>> round(law.doubling_temperature_c, 2)
+    7.0
     """
     listed = np.array(rates, float)
     plain = DarkCurrentLaws(
@@ -144,8 +152,8 @@ def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
 
 
 def black_level(e: Evaluation) -> tuple[float | None, float | None]:
-    """Black level, DN, and its standard deviation: the dark line at no exposure. The standard deviation includes the
-    fixed pattern as a sample of the camera.
+    """Return the black level, DN, and its standard deviation: the dark line at no exposure. The standard deviation
+    includes the fixed pattern as a sample of the camera.
     """
     if not e.levels.darks:
         return None, None
@@ -178,7 +186,7 @@ def dark_signal_hidden(e: Evaluation) -> bool:
 
 
 def dark_current(e: Evaluation) -> tuple[float | None, float | None]:
-    """Dark current, e/s, and its standard deviation: slope of the dark mean against exposure over K."""
+    """Return the dark current, e/s, and its standard deviation: slope of the dark mean against exposure over K."""
     if not e.levels.darks:
         return None, None
     line = e.dark.lines[None]
@@ -191,8 +199,8 @@ def dark_current(e: Evaluation) -> tuple[float | None, float | None]:
 
 
 def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | None]:
-    """Dark current, e/s, and its standard deviation: slope of the dark variance against exposure over K^2, all planes
-    together.
+    """Return the dark current, e/s, and its standard deviation: slope of the dark variance against exposure over K^2,
+    all planes together.
 
     K is that of the flats: the photon transfer of the darks themselves contains the same slope.
     """
@@ -230,7 +238,8 @@ def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | Non
 
 
 def dark_temperature_c(e: Evaluation) -> float | None:
-    """Sensor temperature (deg C) at which the dark currents were measured; None where the darks don't state it.
+    """Return the sensor temperature (deg C) at which the dark currents were measured; None where the darks don't state
+    it.
 
     It is the mean over the darks, weighted by exposure: a dark moves the slope of signal against exposure the more, the
     longer it is."""
@@ -272,8 +281,8 @@ def remark_on_temperatures(e: Evaluation) -> None:
 
 
 def dark_current_temperature(e: Evaluation) -> DarkCurrentLaws | None:
-    """Dark current at every temperature with darks of two exposures, and the laws through those significantly above
-    0.
+    """Return the dark current at every temperature with darks of two exposures, and the laws through those
+    significantly above 0.
     """
     rates: list[tuple[float, float, float]] = []
     temperatures = {level.temperature_c for level in e.levels.all_darks if level.temperature_c is not None}

@@ -71,7 +71,7 @@ class Measured:
     std: float
 
     def over(self, divisor: Measured) -> Measured:
-        """Quotient of independent numbers."""
+        """Return the quotient of independent numbers."""
         quotient = self.value / divisor.value
         return Measured(quotient, math.hypot(self.std / divisor.value, quotient * divisor.std / divisor.value))
 
@@ -119,8 +119,8 @@ class EmvaLevels:
         return nearest if abs(self.dark_exposure[nearest] - exposure_s) <= 1e-6 * exposure_s else None
 
     def below(self, stack_of: FloatArray, line: DarkLine | None) -> FloatArray:
-        """Dark value at the exposure of each level; where none was taken, that of the line, or (None) the smallest of
-        all.
+        """Return the dark value at the exposure of each level; where none was taken, that of the line, or (None) the
+        smallest of all.
         """
         return np.array(
             [
@@ -132,7 +132,9 @@ class EmvaLevels:
         )
 
     def signal_covariance(self) -> FloatArray:
-        """Covariance of the signals (levels, levels), DN^2: levels share the error of a dark that both are less."""
+        """Return the covariance of the signals (levels, levels), DN^2: levels share the error of a dark that both are
+        less.
+        """
         covariance = np.diag(self.light_mean_std**2)
         for number, std in enumerate(self.dark_mean_std):
             shared = np.array([source == number for source in self.source], float)
@@ -142,7 +144,7 @@ class EmvaLevels:
         return covariance + gradient @ self.mean_line.covariance @ gradient.T
 
     def gain(self, used: BoolArray) -> Measured:
-        """System gain K: slope through the origin of the variance against the signal, over the levels `used`
+        """Return the system gain K: slope through the origin of the variance against the signal, over the levels `used`
         (levels,).
         """
         x = np.where(used, self.signal, 0.0)
@@ -163,8 +165,9 @@ class EmvaLevels:
 
 
 def mean_std(levels: Sequence[MeasuredLevel], name: str) -> FloatArray:
-    """Standard deviations of the means of a plane: temporal noise and rounding, increased where repeats differ by more
-    than by a drift."""
+    """Return the standard deviations of the means of a plane: temporal noise and rounding, increased where repeats
+    differ by more than by a drift.
+    """
     noise, excess, freedom = [], 0.0, 0
     planes = [level.plane[name] for level in levels]
     for level, plane in zip(levels, planes, strict=True):
@@ -181,8 +184,8 @@ def mean_std(levels: Sequence[MeasuredLevel], name: str) -> FloatArray:
 
 
 def mean_ratio(x: FloatArray, y: FloatArray, std: FloatArray, slope: Measured) -> float | None:
-    """Mean of y / x (levels,), where it or the single levels contradict the line y = `slope` x by more than the noise
-    `std` (levels,) of y; None where they don't.
+    """Return the mean of y / x (levels,), where it or the single levels contradict the line y = `slope` x by more than
+    the noise `std` (levels,) of y; None where they don't.
 
     It is the slope of the same line with equal relative weights: where y is proportional to x, both are the same.
     """

@@ -120,7 +120,8 @@ def transfer_of(
     darks: Sequence[MeasuredLevel],
     series: Sequence[MeasuredLevel],
 ) -> tuple[TransferFit, list[tuple[MeasuredLevel, str]]]:
-    """Photon transfer of `darks` and the unsaturated flats with repeats of the `series`, and its points (level, plane).
+    """Fit the photon transfer of `darks` and the unsaturated flats with repeats of the `series`, and its points (level,
+    plane).
 
     Raises `NotDetermined` where fewer than three unsaturated flat levels have repeats, or where the variance doesn't
     grow with the signal.

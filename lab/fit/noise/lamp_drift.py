@@ -30,7 +30,7 @@ class LampDrift:
 
 
 def lamp_drift(recorded: RecordedLevels, dark: DarkSignal, saturation: Saturation) -> LampDrift:
-    """Differences of the means of repeated flats, over all unsaturated levels and planes."""
+    """Compare the means of repeated flats, over all unsaturated levels and planes."""
     relative, square, expected, chi2, freedom = 0.0, 0.0, 0.0, 0.0, 0
     for level in recorded.flats:
         unclipped = [n for n in recorded.names if not saturation.clipped[n][recorded.flats.index(level)]]

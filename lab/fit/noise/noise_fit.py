@@ -68,7 +68,7 @@ ASYMMETRY = 0.002  # difference of the light on opposite edges, of the mean, abo
 
 
 def dsnu(e: Evaluation) -> tuple[float | None, float | None]:
-    """DSNU, e, and its standard deviation: the spatial standard deviation of the dark pattern over K."""
+    """Return DSNU, e, and its standard deviation: the spatial standard deviation of the dark pattern over K."""
     pattern = dark_pattern(e)
     if pattern is None or dark_signal_hidden(e):
         return None, None
@@ -79,7 +79,7 @@ def dsnu(e: Evaluation) -> tuple[float | None, float | None]:
 
 
 def prnu(e: Evaluation) -> tuple[float | None, float | None]:
-    """PRNU, %, and its standard deviation: sqrt(pattern variance - dark pattern variance) / signal, of the flat
+    """Return PRNU, %, and its standard deviation: sqrt(pattern variance - dark pattern variance) / signal, of the flat
     nearest to half of saturation, mean over the planes.
     """
     dark = dark_pattern(e)
@@ -227,7 +227,7 @@ def principal_figures(e: Evaluation) -> dict[str, float | None]:
 
 
 def channel_figures(e: Evaluation, principal: dict[str, float | None]) -> dict[str, ChannelNoise]:
-    """Figures of each colour by itself; a channel that its levels don't determine is left out and reported."""
+    """Return the figures of each colour by itself; a channel that its levels don't determine is reported instead."""
     noise_of_channel: dict[str, ChannelNoise] = {}
     for channel in dict.fromkeys(name[0] for name in e.levels.names):
         planes_of_channel = tuple(name for name in e.levels.names if name[0] == channel)
@@ -276,7 +276,7 @@ def emva1288_by_plane(e: Evaluation) -> dict[str, Emva1288]:
 
 
 def photon_transfer_points(e: Evaluation, deviation: dict[tuple[int, str], float]) -> PhotonTransfer:
-    """Points of the plot: flats by channel, means over the planes of the channel."""
+    """Return the points of the plot: flats by channel, means over the planes of the channel."""
     used = {(id(level), name): bool(flag) for (level, name), flag in zip(e.points, e.transfer.used, strict=True)}
     rows: list[tuple[str, float, float, float, float, float, bool, float | None]] = []
     channels = dict.fromkeys(name[0] for name in e.levels.names)
@@ -362,7 +362,7 @@ MIN_SIZE_PX = 16
 
 
 def fit_noise(recordings: RecordingSet, side: Side, drifts: Sequence[RepeatDrift] | None = None) -> NoiseFit:
-    """Photon transfer of one camera from its darks and flats (two repeats or more per level).
+    """Fit the photon transfer of one camera to its darks and flats (two repeats or more per level).
 
     Flats and darks of the most frequent `gain_db` are used; the conversion gain is given for 0 dB. `drifts`: of the
     side's repeats over time, None: they are looked for. No more than one level is held in memory. Raises
@@ -472,7 +472,7 @@ Setting = tuple[str, float, float | None, float | None, float | None]
 
 
 def fit_level_table(file: Path, camera: DataSheet) -> FitResult:
-    """Photon transfer from the table `file`, of a camera whose `cfa`, `bit_depth` and levels `camera` states.
+    """Fit the photon transfer to the table `file`, of a camera whose `cfa`, `bit_depth` and levels `camera` states.
 
     Raises InputError with one line where a column is missing or unknown (another unit, above all) or a cell is no
     number, and `NotDetermined` where the levels don't determine the conversion gain.

@@ -46,7 +46,7 @@ class PixelMaps:
 
 
 def pixel_maps(recordings: RecordingSet, side: Side) -> PixelMaps:
-    """Maps of offset, dark current and relative gain of the pixels of `side`.
+    """Return maps of offset, dark current and relative gain of the pixels of `side`.
 
     Offset and dark current: a weighted line through the dark means of each pixel against exposure, of the darks of the
     temperature at which most flats, or else most darks, were taken. Gain: the weighted

@@ -64,11 +64,18 @@ class NormalEquations:
 
 
 def normal_equations(sharp: Array, blurred: Array, support: int) -> NormalEquations:
-    """Sum the exact normal equations over the pixels for which the whole kernel (support, support) sees `sharp`; both
-    pictures (rows, cols).
+    """Sum the exact normal equations over the pixels for which the whole kernel sees `sharp`.
+
+    sharp, blurred : (rows, cols)
+    support : rows and columns of the kernel, odd
 
     The sums over the windows of all elements are those over the window of the last element, updated by the rows and
     columns that enter and leave: O(support^2 pixels) instead of O(support^4 pixels).
+
+    >>> sharp = np.random.default_rng(1).random((12, 14))
+    >>> equations = normal_equations(sharp, sharp, 3)
+    >>> bool(np.allclose(np.linalg.solve(equations.gram, equations.right), [0, 0, 0, 0, 1, 0, 0, 0, 0]))
+    True
     """
     s, h = support, support // 2
     rows, cols = sharp.shape
@@ -161,10 +168,19 @@ def normal_equations_right(sharp: Array, blurred: Array, support: int) -> tuple[
 
 
 def on_simplex(quadratic: Array, linear: Array, start: Array, solves: int = MOST_SOLVES) -> Array:
-    """Minimise 1/2 x^T Q x - c^T x over x >= 0, sum x = 1, from `start` (n,): `quadratic` Q (n, n), `linear` c (n,).
+    """Minimise 1/2 x^T Q x - c^T x over x >= 0, sum x = 1.
 
-    Accelerated projected gradients with restarts (O'Donoghue and Candes 2015), then an exact active-set step. `solves`
-    limits that step, each iteration of which costs one factorisation; it ends by itself at the optimum.
+    quadratic : Q (n, n), positive definite
+    linear : c (n,)
+    start : x to begin with, (n,)
+    solves : limit of the active-set step, each iteration of which costs one factorisation; it ends by itself at the
+        optimum
+
+    Returns x (n,). Accelerated projected gradients with restarts (O'Donoghue and Candes 2015), then an exact active-set
+    step.
+
+    >>> on_simplex(np.eye(3), np.array([0.9, 0.3, -1.0]), np.full(3, 1.0 / 3.0)).round(6).tolist()
+    [0.8, 0.2, 0.0]
     """
     scale = np.sqrt(np.diag(quadratic).mean())
     q, c = quadratic / scale**2, linear / scale**2
@@ -320,7 +336,15 @@ def _both_axes(vectors: Array, matrix: Array) -> Array:
 
 
 def envelope_of(kernel: Array) -> Array:
-    """Return the local mean of a kernel over about a pixel, at least 5e-4 of its maximum; the largest is 1."""
+    """Return the local mean of a kernel over about a pixel, at least 5e-4 of its maximum; the largest is 1.
+
+    kernel : (support, support)
+
+    Returns (support^2,).
+
+    >>> float(envelope_of(np.pad([[1.0]], 2)).reshape(5, 5)[2, 2])
+    1.0
+    """
     local = ndimage.gaussian_filter(kernel, 0.6, mode="constant")
     return np.asarray(np.maximum(local / local.max(), 5e-4).ravel())
 
@@ -462,7 +486,15 @@ def solve_kernel(
 
 
 def displace(picture: Array, field: Array) -> Array:
-    """Read `picture` (rows, cols) at each pixel's place plus `field` (2, rows, cols), px, by splines of order 5."""
+    """Read `picture` at each pixel's place plus `field`, by splines of order 5.
+
+    picture : (rows, cols)
+    field : displacement in rows and in columns, (2, rows, cols), px
+
+    >>> ramp = np.tile(np.arange(20.0), (20, 1))
+    >>> float(displace(ramp, np.full((2, 20, 20), 0.25))[10, 10].round(3))
+    10.25
+    """
     rows, cols = np.indices(picture.shape, dtype=float)
     return np.asarray(ndimage.map_coordinates(picture, [rows + field[0], cols + field[1]], order=5, mode="nearest"))
 
@@ -568,15 +600,32 @@ def estimate_kernel(
     *,
     register: bool = True,
 ) -> KernelEstimate:
-    """Estimate the kernel that blurs `sharp` into `blurred`, both (rows, cols); `support` is odd.
+    """Estimate the kernel that blurs `sharp` into `blurred`.
 
         blurred[r, c] = sum_ij kernel[i, j] sharp[r - i + support // 2, c - j + support // 2] + noise
 
-    on the rows and columns at least support // 2 from the border; kernel >= 0, sum 1. `noise_std` is estimated from
-    the residual where it isn't given. With `register`, where the residual shows that `sharp` was drawn a little off
-    its place (`displacement`), the places are refined together with the kernel, except a common shift, which belongs
-    to the kernel. Raises ValueError for arguments of the wrong shape or size; `NotDetermined` where the picture is
-    smaller than 2 x support, isn't finite or has no structure, or where `sharp` doesn't explain `blurred`.
+    on the rows and columns at least support // 2 from the border; kernel >= 0, sum 1.
+
+    sharp, blurred : (rows, cols)
+    support : rows and columns of the kernel, odd
+    noise_std : standard deviation of the noise, in the unit of `blurred`; by default it is estimated from the residual
+    register : where the residual shows that `sharp` was drawn a little off its place (`displacement`), refine the
+        places together with the kernel, except a common shift, which belongs to the kernel
+
+    Returns the kernel and its standard deviation, (support, support). Raises ValueError for arguments of the wrong
+    shape or size; `NotDetermined` where the picture is smaller than 2 x support, isn't finite or has no structure, or
+    where `sharp` doesn't explain `blurred`.
+
+    >>> import calibench
+    >>> import numpy as np
+    >>> from scipy.signal import convolve
+    >>> rng = np.random.default_rng(1)
+    >>> sharp = rng.random((60, 60))
+    >>> truth = np.array([[0.0, 0.1, 0.0], [0.1, 0.5, 0.2], [0.0, 0.1, 0.0]])
+    >>> blurred = convolve(sharp, truth, mode="same") + 1e-3 * rng.standard_normal((60, 60))
+    >>> estimate = calibench.estimate_kernel(sharp, blurred, 3, noise_std=1e-3)
+    >>> estimate.kernel.round(2).tolist()[1]
+    [0.1, 0.5, 0.2]
     """
     u, b = np.asarray(sharp, dtype=float), np.asarray(blurred, dtype=float)
     if u.shape != b.shape or u.ndim != 2:

@@ -113,12 +113,24 @@ def compare_curves(
     """Find the wavelength bands in which fitted curves differ from stated ones, up to one factor that all channels
     share.
 
-    `value`, `stated` (channels x wavelengths,), channel after channel; `covariance` of `value` without what is common
-    to all. The factor is the median of value / stated where `stated` is above a fifth of its maximum: bands that
-    differ don't change it. Every band of neighbouring wavelengths of every channel is tested by its mean difference;
-    the significance (normal, two-sided) is corrected for the number of bands. Bands are taken by significance, each
-    apart from those before it, down to the level that curves which are as stated exceed in at most 1 % of fits.
+    wavelength_nm : (m,)
+    channels : their names
+    value, stated : fitted and stated curves (channels x m,), channel after channel
+    covariance : of `value`, without what is common to all
+
+    The factor is the median of value / stated where `stated` is above a fifth of its maximum: bands that differ don't
+    change it. Every band of neighbouring wavelengths of every channel is tested by its mean difference; the
+    significance (normal, two-sided) is corrected for the number of bands. Bands are taken by significance, each apart
+    from those before it, down to the level that curves which are as stated exceed in at most 1 % of fits.
+
     Returns the factor and the bands.
+
+    >>> wavelength_nm = np.arange(400.0, 500.0, 10.0)
+    >>> fitted = np.full(30, 0.55)
+    >>> fitted[15:17] = 0.45  # G at 450 and 460 nm
+    >>> factor, bands = compare_curves(wavelength_nm, ["R", "G", "B"], fitted, 0.01**2 * np.eye(30), np.full(30, 0.5))
+    >>> round(factor, 3), [(band.channel, band.from_nm, band.to_nm) for band in bands]
+    (1.1, [('G', 450.0, 460.0)])
     """
     high = stated > 0.2 * stated.max()
     scale = float(np.median(value[high] / stated[high]))

@@ -256,11 +256,24 @@ def estimate_sensitivity(
 ) -> Sensitivity:
     """Estimate the sensitivity S(w) from signals C_i = integral L_i(w) S(w) dw + noise.
 
-    `wavelength_nm` (m,), ascending; `lights` (n, m), photons (or power) per nm; `signal`, `signal_std` (n,). S is in
-    signal per photon (or energy), on `wavelength_nm`; integrals are by the trapezoidal rule. Where no light shines,
-    `std` is large and `determined` False. Raises ValueError where shapes don't fit, values aren't finite, a light is
-    negative by more than noise, a standard deviation isn't above 0, or fewer than 3 lights differ. The method:
-    `lab.fit.spectral`.
+    wavelength_nm : (m,), ascending; integrals are by the trapezoidal rule
+    lights : (n, m), photons (or power) per nm
+    signal, signal_std : (n,)
+
+    Returns S in signal per photon (or energy) on `wavelength_nm`; where no light shines, its `std` is large and
+    `determined` False. Raises ValueError where shapes don't fit, values aren't finite, a light is negative by more than
+    noise, a standard deviation isn't above 0, or fewer than 3 lights differ. The method: `lab.fit.spectral`.
+
+    >>> import calibench
+    >>> import numpy as np
+    >>> wavelength_nm = np.arange(400.0, 701.0, 5.0)
+    >>> truth = 0.6 * np.exp(-0.5 * ((wavelength_nm - 550.0) / 40.0) ** 2)
+    >>> centres_nm = np.arange(400.0, 701.0, 10.0)
+    >>> lights = 1e6 * np.exp(-0.5 * ((wavelength_nm - centres_nm[:, None]) / 5.0) ** 2)
+    >>> signal = np.trapezoid(lights * truth, wavelength_nm, axis=1)
+    >>> estimate = calibench.estimate_sensitivity(wavelength_nm, lights, signal, np.full(31, 1e3))
+    >>> bool(np.abs(estimate.sensitivity - truth).max() < 0.02)
+    True
     """
     wave, light, value, std = (np.asarray(a, float) for a in (wavelength_nm, lights, signal, signal_std))
     _refuse_unusable(wave, light, value, std)
@@ -299,17 +312,28 @@ def _refuse_unusable(wave: FloatArray, light: FloatArray, value: FloatArray, std
 
 
 def different_spectra(light: FloatArray) -> int:
-    """Count the spectra (n, wavelengths) that differ by more than the repeatability of the radiometer.
+    """Count the spectra that differ by more than the repeatability of the radiometer.
 
-    It is the number of singular values of the normalised lights above it. A light taken twice, or at two levels,
-    counts once.
+    light : (n, wavelengths)
+
+    It is the number of singular values of the normalised lights above it. A light taken twice, or at two levels, counts
+    once.
+
+    >>> different_spectra(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 2.0, 0.0]]))
+    2
     """
     unit = light / np.linalg.norm(light, axis=1, keepdims=True)
     return int(np.sum(np.linalg.svd(unit, compute_uv=False) > np.sqrt(2.0) * RADIOMETER_STD))
 
 
 def trapezoid_weights(wave: FloatArray) -> FloatArray:
-    """Return the weights (m,) of the trapezoidal rule."""
+    """Return the weights (m,) of the trapezoidal rule.
+
+    wave : places (m,), ascending
+
+    >>> trapezoid_weights(np.array([400.0, 410.0, 430.0])).tolist()
+    [5.0, 15.0, 10.0]
+    """
     half = np.diff(wave) / 2.0
     return np.append(half, 0.0) + np.append(0.0, half)
 

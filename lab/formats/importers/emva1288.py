@@ -57,7 +57,16 @@ class ImageDescriptor:
 
 
 def parse_descriptor(text: str) -> ImageDescriptor:
-    """Return the descriptor in `text`; InputError with `line N: ...` where a line can't be understood."""
+    r"""Return the descriptor of an EMVA 1288 data set.
+
+    text : lines `v` release, `n` bits width height, `b` exposure (ns) photons, `d` exposure (ns), `i` image
+
+    Raises InputError with `line N: ...` where a line can't be understood.
+
+    >>> descriptor = parse_descriptor("n 12 640 480\nb 1000000 250.0\ni flat1.tif\ni flat2.tif\n")
+    >>> descriptor.bits, descriptor.levels[0].exposure_s, descriptor.levels[0].images
+    (12, 0.001, ['flat1.tif', 'flat2.tif'])
+    """
     descriptor = ImageDescriptor()
     unused: Counter[str] = Counter()
     for number, line in enumerate(text.removeprefix("\ufeff").splitlines(), start=1):

@@ -94,7 +94,11 @@ def is_fits(file: Path) -> bool:
 
 
 def unpacked_name(name: str) -> str:
-    """Return the name of a FITS file without the ending of its packing; other names as they are."""
+    """Return the name of a FITS file without the ending of its packing; other names as they are.
+
+    >>> unpacked_name("flat-1.fits.gz"), unpacked_name("notes.gz")
+    ('flat-1.fits', 'notes.gz')
+    """
     inner = name[: -len(PACKED[0])] if name.lower().endswith(PACKED) else name
     return inner if inner.lower().endswith(FITS) else name
 

@@ -81,7 +81,12 @@ OTHER_PARTS = ("WIND", "GUIDE", "MOTOR", "SLEW")
 
 
 def setting_of(keyword: str) -> FrameSetting | None:
-    """Return the setting that a keyword states, by the list or by a part of its name; None where it states none."""
+    """Return the setting that a header's keyword states, by the list or by a part of its name; None where it states
+    none.
+
+    >>> setting_of("GAIN").keywords[0], setting_of("OBSERVER")
+    ('GAIN', None)
+    """
     if keyword in KEYWORDS:
         return KEYWORDS[keyword]
     name = keyword.upper()
@@ -91,12 +96,24 @@ def setting_of(keyword: str) -> FrameSetting | None:
 
 
 def text_of(value: Value) -> str:
-    """Return a setting's value as it is written."""
+    """Return a setting's value as it is written; whole numbers without a decimal point.
+
+    >>> text_of(100.0), text_of("HIGH")
+    ('100', 'HIGH')
+    """
     return value if isinstance(value, str) else f"{value:.6g}"
 
 
 def is_same(keyword: str, first: Value, second: Value) -> bool:
-    """Return whether two values of a keyword are one setting."""
+    """Return whether two values of a keyword are one setting: equal, of texts but for case, or within the setting's
+    factor.
+
+    keyword : of the header
+    first, second : numbers or texts
+
+    >>> is_same("READMODE", "Low noise", "LOW NOISE"), is_same("GAIN", 100.0, 200.0)
+    (True, False)
+    """
     if isinstance(first, str) or isinstance(second, str):
         return text_of(first).casefold() == text_of(second).casefold()
     low, high = sorted((first, second))
@@ -258,7 +275,16 @@ ALL_FRAMES = HeaderChoice()
 
 
 def parse_choice(only: str, ignored: str) -> HeaderChoice:
-    """Return `--only KEY=VALUE,...` and `--ignore KEY,...` as a choice. Raises InputError, naming the option."""
+    """Return which frames to import by their headers, and which keywords to ignore.
+
+    only : `KEY=VALUE,...` of `--only`
+    ignored : `KEY,...` of `--ignore`
+
+    Raises InputError, which names the option.
+
+    >>> parse_choice("GAIN=100", "OFFSET").only
+    (('GAIN', '100'),)
+    """
     pairs = []
     for part in filter(None, (text.strip() for text in only.split(","))):
         keyword, equals, value = (text.strip() for text in part.partition("="))
@@ -282,7 +308,11 @@ def is_chosen(choice: HeaderChoice, kind: str, settings: Mapping[str, Value]) ->
 
 
 def states(settings: Mapping[str, Value], keyword: str, wanted: str) -> bool:
-    """Return whether settings hold a value that is written as `wanted`."""
+    """Return whether settings hold a value that is written as `wanted`.
+
+    >>> states({"GAIN": 100.0}, "GAIN", "100")
+    True
+    """
     try:
         value: Value = float(wanted)
     except ValueError:

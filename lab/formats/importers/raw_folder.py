@@ -138,8 +138,15 @@ def _columns() -> list[str]:
 
 
 def capture_of_row(row: dict[str, str]) -> dict[str, Any]:
-    """Return a row as a capture's keys: lists and numbers out of their cells, `screen.x` into `screen`. Raises
-    InputError without the row."""
+    """Return a row of an index as a capture's keys: lists and numbers out of their cells, `screen.x` into `screen`.
+
+    row : cells by column
+
+    Raises InputError without the row.
+
+    >>> capture_of_row({"frame": "edge.tif", "kind": "slanted_edge", "region": "0 0 64 64"})["region"]
+    [0, 0, 64, 64]
+    """
     if "frame" not in row or "kind" not in row:
         raise InputError("the frame or its kind is missing; write both")
     if row["kind"] == "checkerboard" and "squares" in row and "square_mm" in row:
@@ -247,7 +254,7 @@ def _has(file: Path, keyword: str, settings: Mapping[Path, Mapping[str, object]]
 
 
 def read_checkerboard_pairs(path: Path, corners: tuple[int, int], square_mm: float) -> RecordingSet:
-    """Pairs of images `leftNN` and `rightNN` of a plain checkerboard as a recording set of two grey cameras.
+    """Read pairs of images `leftNN` and `rightNN` of a plain checkerboard as a recording set of two grey cameras.
 
     `corners`: inner corners of the board, (rows, cols), one less than its squares. Only whole pairs are taken; the
     warnings say which images were left out.
@@ -283,7 +290,7 @@ def read_checkerboard_pairs(path: Path, corners: tuple[int, int], square_mm: flo
 def read_boards(
     path: Path, dictionary: Literal["none", "dots"], points: tuple[int, int], spacing_mm: float
 ) -> RecordingSet:
-    """Pictures of a plane board, each in another pose, as a recording set of one camera.
+    """Read pictures of a plane board, each in another pose, as a recording set of one camera.
 
     `points`: inner corners of a plain checkerboard (`dictionary` none) or dots, (rows, cols). `path`: a folder of
     images in the order of their names, or one image; `camera.toml` beside them has the camera's keys, `cfa` at least.
@@ -311,7 +318,7 @@ def read_boards(
 
 
 def read_dot_grids(path: Path, dots: tuple[int, int], spacing_mm: float) -> RecordingSet:
-    """Pictures of a plane grid of `dots` (rows, cols): see `read_boards`."""
+    """Read pictures of a plane grid of `dots` (rows, cols): see `read_boards`."""
     return read_boards(path, "dots", dots, spacing_mm)
 
 

@@ -63,13 +63,19 @@ class ImportOptions:
     ignore: str | None = None
 
     def stated(self) -> tuple[str, ...]:
-        """Names of the options that are stated, as on the command line."""
+        """Return the names of the options that are stated, as on the command line."""
         names = (field.name for field in fields(self))
         return tuple(f"--{name.replace('_', '-')}" for name in names if getattr(self, name) is not None)
 
 
 def grid(option: str, text: str) -> tuple[int, int] | None:
-    """ROWSxCOLS as two numbers; None where `text` is empty. Raises InputError, with the option's name."""
+    """Return ROWSxCOLS as two numbers; None where `text` is empty.
+
+    option : its name, with which an InputError begins
+
+    >>> grid("--squares", "6x9")
+    (6, 9)
+    """
     if not text:
         return None
     match = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
@@ -79,8 +85,13 @@ def grid(option: str, text: str) -> tuple[int, int] | None:
 
 
 def chart_corners(option: str, text: str) -> tuple[tuple[float, float], ...] | None:
-    """Eight numbers with commas as four corners (row, col); None where `text` is empty. Raises InputError, with the
-    option's name."""
+    """Return eight numbers with commas as four corners (row, col), px; None where `text` is empty.
+
+    option : its name, with which an InputError begins
+
+    >>> chart_corners("--corners", "10,20,10,620,470,620,470,20")[1]
+    (10.0, 620.0)
+    """
     if not text:
         return None
     try:
@@ -133,8 +144,8 @@ def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
 
 
 def locate_chart(frame: Frame, camera: DataSheet) -> Corners | None:
-    """Corners of the grid of patches, [row, col] of dark skin, bluish green, black, white; None where no chart is
-    found.
+    """Find the corners of the grid of patches, [row, col] of dark skin, bluish green, black, white; None where no chart
+    is found.
 
     Patches are found by OpenCV's MCC detector in the mosaic binned to its period; a homography through the 24 centres
     gives the corners."""
@@ -358,7 +369,7 @@ def _check_grey_row(path: Path, frame: Frame, camera: DataSheet, corners: Corner
 
 
 def grey_levels(frame: Frame, corners: Corners) -> NDArray[np.floating[Any]]:
-    """Mean DN of the inner parts of the patches of the grey row, white first."""
+    """Return the mean DN of the inner parts of the patches of the grey row, white first."""
     corner, v = np.array(corners, float), (PATCH_ROWS - 0.5) / PATCH_ROWS
     half = max(int(0.15 * np.linalg.norm(corner[1] - corner[0]) / PATCH_COLS), 1)
     levels = []

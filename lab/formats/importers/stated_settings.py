@@ -360,7 +360,13 @@ def _remarks(seen: Sequence[_HeaderSeen]) -> list[str]:
 
 def join_alike(texts: Sequence[tuple[Path | str, str]]) -> list[str]:
     """Return one line for all files with the same text but for numbers: the first file, its text, how many more, and
-    whether these have other numbers."""
+    whether these have other numbers.
+
+    texts : (file, text) of each
+
+    >>> join_alike([("a.fits", "EXPTIME 1 s"), ("b.fits", "EXPTIME 2 s")])
+    ['a.fits and 1 more: EXPTIME 1 s (others have other values)']
+    """
     alike_texts: dict[str, list[tuple[Path | str, str]]] = {}
     for file, text in texts:
         alike_texts.setdefault(re.sub(r"[\d.+-]+", "#", text), []).append((file, text))
@@ -452,7 +458,11 @@ def same_exposure(stated_s: float | None, header: FrameHeader) -> bool:
 
 
 def same_f_number(stated: float | None, header: float | None) -> bool:
-    """Return whether two f-numbers are one marking; yes where one is unknown."""
+    """Return whether two f-numbers are one marking; yes where one is unknown.
+
+    >>> same_f_number(2.8, 2.83), same_f_number(2.8, 4.0), same_f_number(None, 4.0)
+    (True, False, True)
+    """
     return not stated or not header or max(stated / header, header / stated) <= F_NUMBER_FACTOR
 
 
