@@ -61,16 +61,20 @@ class Trails:
             species.append((np.asarray(lost / (1.0 + lost / held)), held))
         return species
 
-    def clock(self, electrons: FloatArray) -> FloatArray:
+    def clock(self, electrons: FloatArray, margins: tuple[int, int] = (0, 0)) -> FloatArray:
         """Return the mean electrons (rows, cols) that are read, given those in the pixels.
 
         exp(n loss (T - 1)) of each source line by its own n, as the series of (T - 1)^m of n^m loss^m / m! times the
         source. What is released behind the last line isn't in the frame.
+
+        margins : lines before the first active one and behind the last one (`Margins.lines`). Transfers are counted
+            from the first active line on, so that the active area is read as it would be without them
         """
         packets = np.moveaxis(electrons, self.axis, 0)
+        ahead = margins[0]
         if self.output == "last":
-            packets = packets[::-1]
-        transfers = np.arange(1.0, len(packets) + 1.0)[:, None]
+            packets, ahead = packets[::-1], margins[1]
+        transfers = np.maximum(np.arange(1.0, len(packets) + 1.0) - ahead, 0.0)[:, None]
         if self.at_once:
             read = packets
             for kept, held in self._retain_at_once(transfers):
