@@ -65,6 +65,7 @@ def expected_electrons(
     oversample: int = 3,
     margin_px: int = 32,
     source: float = 1.0,
+    margins: Margins = NO_MARGINS,
 ) -> FloatArray:
     """Mean electrons (rows, cols) of every pixel, light and dark current, after the effects on charge; not yet clipped.
 
@@ -75,13 +76,14 @@ def expected_electrons(
     0.6, 0.2, 0.1, 0.05 % of white rms; a frame of 480 x 640 takes 0.5, 1.1, 2.4 s of one core at 2, 3, 4. Cells of a
     whole number of pixels whose borders are the pixels' alias alike all over the frame: at s samples a pixel an
     amplitude at f cy/px is drawn too high by (pi f / s)^2 / 3 along each axis, 3 % at 0.3 cy/px and 3 samples.
-    `source`: factor on the scene's light, such as `unsteady_source` of the frame that is drawn.
+    `source`: factor on the scene's light, such as `unsteady_source` of the frame that is drawn. `margins`: around the
+    active area in the frame that is returned.
     """
     check_overlap(camera, exposure.scene)
     light = scene_light(
         camera, exposure.scene, effects, oversample=oversample, margin_px=margin_px, placed=exposure.placed
     )
-    return collect_electrons(light, camera, exposure, effects, source=source)
+    return collect_electrons(light, camera, exposure, effects, source=source, margins=margins)
 
 
 def unsteady_source(camera: CameraModel, effects: Sequence[Effect], elapsed_s: float) -> float:
@@ -377,8 +379,10 @@ def sample(
     *,
     oversample: int = 3,
     margin_px: int = 32,
+    margins: Margins = NO_MARGINS,
 ) -> NDArray[np.uint16]:
-    """One raw frame (rows, cols) drawn from the model. `fixed_pattern` None: pixels that are all alike.
+    """One raw frame (rows, cols) drawn from the model. `fixed_pattern` None: pixels that are all alike. `margins`: of
+    the frame, and of the fixed pattern.
 
     For many frames of one scene take `expected_electrons` once and draw with `sim.sensor.electrons.sample_from`.
     """
@@ -390,13 +394,14 @@ def sample(
             oversample=oversample,
             margin_px=margin_px,
             source=unsteady_source(camera, effects, exposure.elapsed_s),
+            margins=margins,
         ),
         camera,
         rng,
         fixed_pattern,
-        dark_electrons=dark_electrons(camera, exposure, effects),
+        dark_electrons=dark_electrons(camera, exposure, effects, margins),
         gain_db=exposure.gain_db,
-        read_out=read_out(camera, exposure, effects),
+        read_out=read_out(camera, exposure, effects, margins),
     )
 
 
