@@ -30,12 +30,12 @@ from lab.inference.closed_form import (
     signatures_of,
 )
 from lab.inference.hypotheses import (
-    DEGREES,
     Coordinate,
     Hypothesis,
     SetPrior,
     coordinates_of,
     moved,
+    size_precision,
     stacked,
     symmetric,
 )
@@ -554,16 +554,14 @@ class Search:
         if len(near) != 1:
             return found
         (k,) = near
-        c = coords[k]
-        slope, precision = c.slope_and_precision(float(u[k]))
         at = float(r @ r)
 
         def exact(d: FloatArray) -> float:
             white = gaussian.whiten(self.model.value - self.model.mean(moved(state, u + d)))
-            return -0.5 * (float(white @ white) - at) + float(c.log_prior(u[k] + d[k]) - c.log_prior(float(u[k])))
+            return -0.5 * (float(white @ white) - at)
 
         def approximate(d: FloatArray) -> float:
-            return float(b @ d - 0.5 * d @ a @ d + slope * d[k] - 0.5 * precision * d[k] ** 2)
+            return float(b @ d - 0.5 * d @ a @ d)
 
         plain = integrate(a, b, coords, u, skip=frozenset((k,)))
         more = correct_along(plain, k, coords, u, approximate, exact)
@@ -906,7 +904,8 @@ def _normal_prior(coords: Sequence[Coordinate], u: FloatArray) -> tuple[FloatArr
         elif c.is_shape:
             precision.append(c.scale**-2.0)
         else:
-            precision.append((DEGREES + 1.0) / (DEGREES + ((x - c.centre) / c.scale) ** 2) / c.scale**2)
+            t = np.asarray((x - c.centre) / c.scale)
+            precision.append(float(size_precision(t, np.asarray(c.smaller))) / c.scale**2)
     found = np.array(precision)
     centre = np.array([c.centre if np.isfinite(c.scale) else x for c, x in zip(coords, u, strict=True)])
     return found, found * (centre - u)
