@@ -139,3 +139,25 @@ def test_a_law_that_is_wrong_by_more_than_it_declares_is_inexact(bend: float, in
     posterior = read_table(Search(toy, hypotheses, SetPrior({"line": "lines"})).run(), hypotheses)
     assert [f.name for f in posterior.named] == ["line"]
     assert (posterior.inexact["line"] > 0.5) == inexact
+
+
+def test_two_others_are_found_in_the_place_of_an_inexact_member() -> None:
+    """A line and a wave of 60 and 30 standard deviations, and `both`, a law that changes the numbers by the sum of
+    equal ones: alone it is wrong by a third of its change, three times its tolerance. From it, the right pair is an
+    exchange of one for two."""
+    laws = {
+        "line": lambda u: 60.0 * u[0] * (X + 0.2),
+        "wave": lambda u: 60.0 * u[0] * np.sin(9.0 * X),
+        "both": lambda u: 60.0 * u[0] * (X + 0.2 + np.sin(9.0 * X)),
+    }
+    noise = np.random.default_rng(3).standard_normal(POINTS)
+    value = laws["line"](np.ones(1)) + laws["wave"](np.array([0.5])) + noise
+    hypotheses = {name: linear(name, f"{name}s", 1.0) for name in laws}
+    toy = InexactToy(value, laws, np.zeros((POINTS, 0)))
+    search = Search(toy, hypotheses, SetPrior({name: h.family for name, h in hypotheses.items()}))
+    search.fit({})
+    assert search.fit({"both": Point(np.array([0.7]))}).inexact > 0.5
+    assert search._exchange()
+    assert search._log_posterior(search.fits[frozenset(("line", "wave"))]) == search._top()
+    assert search.fits[frozenset(("line", "wave"))].inexact < 0.5
+    assert not search._exchange()
