@@ -89,6 +89,9 @@ NEARLY_LINEAR = 0.3
 STEEP = 0.5
 #: Healthy draws whose p(nothing) is taken as that of a measured set: so many of the lowest, of so many at most.
 LOWEST, MOST_REFINED = 2, 40
+#: Gain of log posterior by unlisted groups from which on parameters are fitted anew with these: where they take most of
+#: what a hypothesis explained, its mode is elsewhere. The most such fits of a set.
+MOVED, MOST_MOVED = 3.0, 3
 #: Gain of log evidence up to which a size may be near 0, where shapes vanish.
 WEAK = 6.0
 #: Log evidence within which two alternatives of one hypothesis are both refitted, and the most that are.
@@ -120,7 +123,8 @@ class FormFit:
 @dataclass(frozen=True)
 class FittedSet:
     """A refitted set at its mode, for each scale of form errors. `jacobian` (n, p) of m by u at the
-    mode; `others`: further modes of the posterior, which `shift` adds to the evidence of this one."""
+    mode; `others`: further modes of the posterior, which `shift` adds to the evidence of this one. `flipped`: fits
+    about the mode with these groups unlisted, where that is another."""
 
     state: State
     coordinates: tuple[Coordinate, ...]
@@ -131,6 +135,12 @@ class FittedSet:
     pull: FloatArray
     others: tuple[FittedSet, ...] = ()
     shift: float = 0.0
+    flipped: Mapping[frozenset[int], FittedSet] = field(default_factory=dict)
+
+    def given(self, unlisted: frozenset[int]) -> FittedSet:
+        """Return the fit about the mode with these groups unlisted."""
+        held = [groups for groups in self.flipped if groups <= unlisted]
+        return self.flipped[max(held, key=len)] if held else self
 
     @property
     def members(self) -> frozenset[str]:
@@ -144,7 +154,13 @@ class FittedSet:
 
     @cached_property
     def quick(self) -> float:
-        """Log p(y | A), near enough to rank sets (`FormFit.quick`)."""
+        """Log p(y | A), near enough to rank sets: without what several unlisted groups gain, where single ones gain
+        little (`FormFit.quick`)."""
+        return self.total if self.single > self.everyday + MOVED else self.single
+
+    @property
+    def single(self) -> float:
+        """Log p(y | A) over no and single unlisted groups, about one mode."""
         return self.shift + log_sum_exp([f.quick + f.log_prior for f in self.forms])
 
     @cached_property
@@ -156,6 +172,11 @@ class FittedSet:
     def by_groups(self) -> Mapping[frozenset[int], float]:
         """Log p(y | A, u) p(u), by which groups are unlisted, summed over the scales of form errors; those far below
         the likeliest count for nothing."""
+        fits = (self, *self.flipped.values())
+        return {u: value for fit in fits for u, value in fit._about_mode.items() if self.given(u) is fit}
+
+    @cached_property
+    def _about_mode(self) -> Mapping[frozenset[int], float]:
         near = [f for f in self.forms if f.quick > self.likeliest.quick - FAR_BELOW]
         sums: dict[frozenset[int], list[float]] = {}
         for form in near:
@@ -166,9 +187,24 @@ class FittedSet:
     @property
     def inexact(self) -> float:
         """Probability that the laws are wrong by more than they declare, given the set."""
+        if self.flipped:
+            fits = (self, *self.flipped.values())
+            own = [[v for u, v in self.by_groups.items() if self.given(u) is fit] for fit in fits]
+            return float(sum(np.exp(log_sum_exp(v) - self.total) * f._inexact for f, v in zip(fits, own, strict=True)))
+        return self._inexact
+
+    @property
+    def _inexact(self) -> float:
         log = [f.quick + f.log_prior for f in self.forms]
         beyond = [w for f, w in zip(self.forms, log, strict=True) if f.form > 1.0]
         return float(np.exp(log_sum_exp(beyond) - log_sum_exp(log))) if beyond else 0.0
+
+    @property
+    def everyday(self) -> float:
+        """Log p(y | A, u) p(u) with all groups everyday."""
+        none = frozenset[int]()
+        own = [f.base - f.start_log + f.scales.everyday + f.scales.log_prior(none) + f.log_prior for f in self.forms]
+        return self.shift + log_sum_exp(own)
 
     @property
     def total(self) -> float:
@@ -333,6 +369,7 @@ class Search:
         """Return the likeliest set without one of its members, from where it stands, if that was never refitted: of all
         members the one nearest to 0, unless even that is excluded."""
         best = max(self.fits.values(), key=self._log_posterior)
+        best = best.given(max(best.by_groups, key=lambda u: best.by_groups[u]))
         places = coordinates_of(self.hypotheses, best.state)
         losses: list[tuple[float, str]] = []
         for name in best.state:
@@ -418,7 +455,7 @@ class Search:
                 modes.append(one)
         total = log_sum_exp([m.base for m in modes])
         merged = replace(best, shift=total - best.base, others=tuple(modes[1:]))
-        merged = self._by_grid_where_weak(merged, estimate)
+        merged = self._with_flips(self._by_grid_where_weak(merged, estimate))
         self.fits[merged.members] = merged
         return merged
 
@@ -460,15 +497,34 @@ class Search:
 
     def fit(self, state: State) -> FittedSet:
         """Return the fit of a set from these parameters, and keep it."""
-        fit = self._fit_at(state)
+        fit = self._with_flips(self._fit_at(state))
         self.fits[fit.members] = fit
         return fit
 
-    def _gaussian(self, state: State, form: float) -> Gaussian:
-        return with_columns(self.model.gaussian(state, form), self._everyday)
+    def _with_flips(self, fit: FittedSet) -> FittedSet:
+        """Return the fit with those about the mode given unlisted groups that make the set likelier than none does:
+        such a mode is another, as the groups explain what a hypothesis would have to."""
+        is_hopeless = self.fits and fit.single + self.prior.log(fit.members) < self._top() - HOPELESS
+        if is_hopeless or not fit.precision.size or fit.single < fit.everyday + MOVED:
+            return fit
+        for _ in range(MOST_MOVED):
+            weights = fit.by_groups
+            best = max(weights, key=lambda u: weights[u])
+            if not best or fit.given(best) is not fit or weights[best] < weights[frozenset()] + MOVED:
+                return fit
+            scales = fit.likeliest.scales.mode(best)
+            fit = replace(fit, flipped={**fit.flipped, best: self._fit_at(fit.state, scales)})
+        return fit
 
-    def _fit_at(self, state: State) -> FittedSet:
+    def _gaussian(self, state: State, form: float, scales: FloatArray | None = None) -> Gaussian:
+        groups = self.model.groups
+        columns = self._everyday if scales is None else scaled_columns(groups, scales, len(self.model.value))
+        return with_columns(self.model.gaussian(state, form), columns)
+
+    def _fit_at(self, state: State, scales: FloatArray | None = None) -> FittedSet:
+        """Return the fit from a state, with the groups at these scales; None: at their median everyday ones."""
         y = self.model.value
+        at = everyday_scales(self.model.groups) if scales is None else scales
         places = coordinates_of(self.hypotheses, state)
         coords = [c for _, _, c in places]
         forms = everyday_forms(self.model.has_form_error(state))
@@ -476,7 +532,10 @@ class Search:
         u = stacked(state)
         if len(u):
             for most in EVALUATIONS:
-                before, u = u, self._mode(moved(state, u), coords, u, self._gaussian(moved(state, u), middle), most)
+                before, u = (
+                    u,
+                    self._mode(moved(state, u), coords, u, self._gaussian(moved(state, u), middle, scales), most),
+                )
                 if np.all(np.abs(u - before) < 1e-3 * np.array([c.unit for c in coords])):
                     break
         state = moved(state, u)
@@ -489,13 +548,15 @@ class Search:
 
         def add(form: FormScale) -> Laplace:
             bare = self.model.gaussian(state, form.share)
-            gaussian = with_columns(bare, self._everyday)
+            gaussian = with_columns(bare, scaled_columns(self.model.groups, at, len(y)))
             white = gaussian.whiten(np.column_stack([jacobian, y - mean]))
             laplace = self._integral(state, coords, u, gaussian, white[:, :-1], white[:, -1])
-            scales = ScaleIntegral.of(bare, y - mean, self.model.groups, jacobian, precision, pull, self.any_unlisted)
-            start_log = scales.log_likelihood(everyday_scales(self.model.groups))
+            free = _within_bounds(coords, u, u + laplace.mean)
+            integral = ScaleIntegral.of(
+                bare, y - mean, self.model.groups, jacobian[:, free], precision[free], pull[free], self.any_unlisted
+            )
             base = own + gaussian.log_likelihood(y) + laplace.log_integral
-            fits.append(FormFit(form.share, form.log_prior, base, scales, start_log))
+            fits.append(FormFit(form.share, form.log_prior, base, integral, integral.log_likelihood(at)))
             return laplace
 
         for form in forms:
@@ -644,15 +705,18 @@ class Search:
     def _linearise(self, origin: FittedSet) -> None:
         """Estimate all sets with one, two or three members more than a fitted one: with all groups everyday, and with
         the likeliest of them unlisted where that matters."""
-        weights, gram = origin.by_groups, self._gram(origin)
+        weights = origin.by_groups
         none: frozenset[int] = frozenset()
         best = max(weights, key=lambda u: weights[u])
+        gram = self._gram(origin)
         for unlisted in dict.fromkeys((none, best)):
             if weights[unlisted] > weights[best] - FAR_BELOW or unlisted == none:
-                self._linearise_with(origin, unlisted, gram)
+                about = origin.given(unlisted)
+                self._linearise_with(origin, unlisted, gram if about is origin else self._gram(about))
 
     def _linearise_with(self, origin: FittedSet, unlisted: frozenset[int], whole: FloatArray) -> None:
-        z, gram = self._linear(whole, origin.likeliest.scales.mode(unlisted))
+        scales = origin.given(unlisted).likeliest.scales
+        z, gram = self._linear(whole, scales.mode(unlisted))
         signatures = self._signatures
         owners: dict[str, list[int]] = {}
         for i, s in enumerate(signatures):
@@ -660,7 +724,7 @@ class Search:
                 owners.setdefault(s.owner, []).append(i)
         outside = [i for own in owners.values() for i in own]
         single = dict(zip(outside, integrate_each(z, gram, [signatures[i] for i in outside]), strict=True))
-        ratio = self._averaged_over_scales(origin.likeliest.scales, unlisted, whole, single)
+        ratio = self._averaged_over_scales(scales, unlisted, whole, single)
         gains = {
             o: log_sum_exp([ratio[i] + signatures[i].log_share for i in own]) - float(np.log(len(own)))
             for o, own in owners.items()
@@ -887,6 +951,14 @@ def _differ(one: FittedSet, other: FittedSet) -> bool:
     std = np.sqrt(np.diag(one.laplace.covariance) + np.diag(other.laplace.covariance))
     away = np.abs(stacked(one.state) - np.concatenate([other.state[n].u for n in one.state]))
     return bool(np.any(away > 2.0 * std))
+
+
+def _within_bounds(coords: Sequence[Coordinate], u: FloatArray, mean: FloatArray) -> np.ndarray:
+    """Return which parameters are marginalised with the groups' scales: those that aren't held at a bound, beyond which
+    the linear problem has its mean. Without bounds they would take what a group explains, with the wrong sign."""
+    low, high = bounds(coords)
+    unit = 1e-3 * np.array([c.unit for c in coords])
+    return np.asarray(~(((mean <= low + unit) & (u <= low + unit)) | ((mean >= high - unit) & (u >= high - unit))))
 
 
 def _choices(point: Point) -> object:
