@@ -44,6 +44,9 @@ from sim.uniform import electron_rate
 
 #: Standard deviations of the noise by which a usual size has to change the numbers.
 LEAST_SHOWN = 0.3
+#: The largest share of its change that a law may be wrong by: the largest tolerance that any effect declares. What
+#: differs by more is another law.
+MOST_WRONG = 0.3
 
 
 @dataclass
@@ -114,7 +117,7 @@ class SideModel:
                 if own.any():
                     size = np.log(np.maximum(np.abs(own), 1e-9 * np.abs(own).max()))
                     alike = self._kernels[index] * np.exp(-0.5 * np.square(size[:, None] - size))
-                    error = form_scale * effect.form_tolerance * own
+                    error = min(form_scale * effect.form_tolerance, MOST_WRONG) * own
                     gaussian = gaussian.with_discrepancy(index, error[:, None] * alike * error)
         return gaussian
 
