@@ -39,7 +39,7 @@ from lab.inference.hypotheses import (
     stacked,
     symmetric,
 )
-from lab.inference.laplace import Laplace, bounds, correct_along, integrate, near_bound
+from lab.inference.laplace import Laplace, best_within_bounds, bounds, correct_along, integrate, near_bound
 from lab.inference.model import (
     FormScale,
     Model,
@@ -92,6 +92,8 @@ LOWEST, MOST_REFINED = 2, 40
 #: Gain of log posterior by unlisted groups from which on parameters are fitted anew with these: where they take most of
 #: what a hypothesis explained, its mode is elsewhere. The most such fits of a set.
 MOVED, MOST_MOVED = 3.0, 3
+#: Gain of log posterior by the linear problem about a mode, above which the prediction has to have a half of it.
+PROMISED = 1.0
 #: Gain of log evidence up to which a size may be near 0, where shapes vanish.
 WEAK = 6.0
 #: Log evidence within which two alternatives of one hypothesis are both refitted, and the most that are.
@@ -504,7 +506,7 @@ class Search:
     def _with_flips(self, fit: FittedSet) -> FittedSet:
         """Return the fit with those about the mode given unlisted groups that make the set likelier than none does:
         such a mode is another, as the groups explain what a hypothesis would have to."""
-        is_hopeless = self.fits and fit.single + self.prior.log(fit.members) < self._top() - HOPELESS
+        is_hopeless = self.fits and self._log_posterior(fit) < self._top() - HOPELESS
         if is_hopeless or not fit.precision.size or fit.single < fit.everyday + MOVED:
             return fit
         for _ in range(MOST_MOVED):
@@ -550,8 +552,9 @@ class Search:
             bare = self.model.gaussian(state, form.share)
             gaussian = with_columns(bare, scaled_columns(self.model.groups, at, len(y)))
             white = gaussian.whiten(np.column_stack([jacobian, y - mean]))
-            laplace = self._integral(state, coords, u, gaussian, white[:, :-1], white[:, -1])
-            free = _within_bounds(coords, u, u + laplace.mean)
+            slope = self._slope(state, coords, u, gaussian, white[:, :-1], white[:, -1])
+            laplace = self._integral(state, coords, u, gaussian, white[:, :-1], white[:, -1], slope)
+            free = _within_bounds(coords, u, u + laplace.mean) & (slope == white[:, :-1].T @ white[:, -1])
             integral = ScaleIntegral.of(
                 bare, y - mean, self.model.groups, jacobian[:, free], precision[free], pull[free], self.any_unlisted
             )
@@ -605,11 +608,35 @@ class Search:
             columns.append((self.model.mean(moved(state, shifted)) - mean) / (shifted[k] - u[k]))
         return np.array(columns).T if columns else np.zeros((len(mean), 0))
 
-    def _integral(
+    def _slope(
         self, state: State, coords: Sequence[Coordinate], u: FloatArray, gaussian: Gaussian, table: FloatArray,
         r: FloatArray,
+    ) -> FloatArray:  # fmt: skip
+        """Return the slope (p,) of the log likelihood at u about which it is integrated: J'r. Where the linear problem
+        promises a gain within the bounds that the prediction doesn't have there, u isn't its mode, and the linear
+        problem says nothing beyond it: parameters that aren't at a bound are integrated about u."""
+        slope = table.T @ r
+        if not len(u):
+            return slope
+        d, gain = best_within_bounds(table.T @ table, slope, coords, u)
+        if gain < PROMISED:
+            return slope
+        more = zip(coords, u, d, strict=True)
+        prior = sum(float(c.log_prior(float(x + dx)) - c.log_prior(float(x))) for c, x, dx in more)
+        white = gaussian.whiten(self.model.value - self.model.mean(moved(state, u + d)))
+        if prior - 0.5 * (float(white @ white) - float(r @ r)) > 0.5 * gain:
+            return slope
+        low, high = bounds(coords)
+        unit = 1e-6 * np.array([c.unit for c in coords])
+        of_prior = np.array([c.slope_and_precision(float(x))[0] for c, x in zip(coords, u, strict=True)])
+        return np.where((u > low + unit) & (u < high - unit), -of_prior, slope)
+
+    def _integral(
+        self, state: State, coords: Sequence[Coordinate], u: FloatArray, gaussian: Gaussian, table: FloatArray,
+        r: FloatArray, b: FloatArray,
     ) -> Laplace:  # fmt: skip
-        a, b = table.T @ table, table.T @ r
+        """Return the integral over the parameters, given the slope b of the log likelihood at u."""
+        a = table.T @ table
         found = integrate(a, b, coords, u)
         near = near_bound(found, coords, u, NEAR)
         if len(near) != 1:
