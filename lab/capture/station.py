@@ -219,7 +219,17 @@ def _complaints(error: ValidationError) -> Iterator[str]:
 
 
 def read_station(path: str | Path) -> Station:
-    """Return the station in a TOML file. Raises InputError, one line that names every wrong key."""
+    r"""Return the station in a TOML file. Raises InputError, one line that names every wrong key.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "station.toml"
+    ...     left = 'driver = "u3v"\naddress = "usb://CAM-1"\n'
+    ...     sheet = 'rows = 480\ncols = 640\ncfa = "MONO"\nbit_depth = 12\n'
+    ...     _ = file.write_text(f'name = "bench"\n[cameras.left]\n{left}[cameras.left.datasheet]\n{sheet}')
+    ...     read_station(file).name
+    'bench'
+    """
     file = Path(path)
     tables = read_toml(file, "give a station file, `calibench bench --station FILE` writes one")
     try:

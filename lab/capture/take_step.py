@@ -157,7 +157,13 @@ def _stuck(
 
 
 def repeats_ahead(steps: Sequence[Step | None]) -> list[int]:
-    """Return how many of the steps that follow each at once only repeat its exposure; None: a step that isn't taken."""
+    """Return how many of the steps that follow each at once only repeat its exposure.
+
+    steps : in order; None: a step that isn't taken
+
+    >>> repeats_ahead([None, None])
+    [0, 0]
+    """
     counts = [0] * len(steps)
     for at in range(len(steps) - 2, -1, -1):
         step, following = steps[at], steps[at + 1]

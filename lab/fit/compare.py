@@ -535,8 +535,20 @@ class FailRule:
 
 
 def failures(comparison: ComparisonResult, rules: Sequence[FailRule]) -> list[str]:
-    """Return the changes that fail any rule, by name. Raises InputError for a rule that concerns no figure of the
-    comparison: a misspelt name, or a figure that one of the two fits lacks, would never fail.
+    """Return the changes that fail any rule, by name.
+
+    comparison : of two fits
+    rules : of `--fail-on`
+
+    Raises InputError for a rule that concerns no figure of the comparison: a misspelt name, or a figure that one of the
+    two fits lacks, would never fail.
+
+    >>> from lab.formats.results import CameraFit, NoiseFit
+    >>> def fitted(read_noise_e):
+    ...     noise = NoiseFit(read_noise_e=read_noise_e, read_noise_e_std=0.05)
+    ...     return FitResult(source="my-camera", cameras={"left": CameraFit(noise=noise)})
+    >>> len(failures(compare(fitted(2.0), fitted(3.0)), [FailRule.parse("noise read_noise_e>10%")]))
+    1
     """
     for rule in rules:
         if not rule.concerns(comparison):

@@ -522,7 +522,16 @@ def transfer_overlays(
 
 
 def mtf_curves(curves: Sequence[MtfCurve]) -> Figure:
-    """Return modulation transfer functions with bands of one standard deviation, spatial frequency in cy/px."""
+    """Return modulation transfer functions with bands of one standard deviation, spatial frequency in cy/px.
+
+    curves : of the slanted edges
+
+    >>> from lab.formats.results import MtfCurve
+    >>> edge = MtfCurve(capture="edge-1", channel="G", angle_deg=5.0, frequency_cy_per_px=(0.0, 0.5), mtf=(1.0, 0.2),
+    ...     mtf_std=(0.0, 0.01), mtf50_cy_per_px=0.31)
+    >>> len(mtf_curves([edge])["data"]) > 0
+    True
+    """
     data: list[Trace] = []
     for curve in curves:
         colour = CHANNEL.get(curve.channel, "#888888")
@@ -914,7 +923,11 @@ def _pack(values: Any) -> dict[str, str] | None:
 
 
 def figure_json(figure: Figure) -> str:
-    """Return a figure as one line of JSON: a trace's numbers as typed arrays, others rounded to 7 digits."""
+    """Return a figure as one line of JSON: a trace's numbers as typed arrays, others rounded to 7 digits.
+
+    >>> figure_json({"data": [], "layout": {"height": 300}})
+    '{"data":[],"layout":{"height":300}}'
+    """
 
     def round_numbers(value: Any, key: str = "") -> Any:
         if key in PACKED and (packed := _pack(value)) is not None:

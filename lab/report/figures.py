@@ -57,7 +57,16 @@ class KeyFigure:
 
 
 def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[KeyFigure]:
-    """Yield results of the photon transfer, with the maker's values."""
+    """Yield results of the photon transfer, with the maker's values.
+
+    noise : of one camera
+    camera : its data sheet, for what the maker states
+
+    >>> from lab.formats.results import NoiseFit
+    >>> noise = NoiseFit(read_noise_e=2.0, read_noise_e_std=0.05)
+    >>> [figure.text for figure in noise_figures(noise) if "read noise" in figure.name][0]
+    '2.000 ± 0.050 e'
+    """
     for field, (name, unit) in NOISE.items():
         value = getattr(noise, field)
         if value is None:

@@ -53,7 +53,15 @@ def photograph_data_uri(image: NDArray[np.uint8]) -> str:
 
 
 def kernel_picture(kernel: ArrayLike, peak: float, margin: int = 0) -> str:
-    """Return a kernel in colours from 0 to `peak` on a square-root scale, `margin` cells cut off at each border."""
+    """Return a kernel in colours from 0 to `peak` on a square-root scale, as the text of a PNG data URI.
+
+    kernel : (n, n)
+    peak : value of the brightest colour
+    margin : cells that are cut off at each border
+
+    >>> kernel_picture(np.eye(9) / 9.0, 0.2, margin=1)[:14]
+    'data:image/png'
+    """
     values = np.asarray(kernel, float)
     if margin:
         values = values[margin:-margin, margin:-margin]
@@ -84,7 +92,15 @@ def map_picture(values: ArrayLike, width_px: int | None = None) -> tuple[NDArray
 
 
 def difference_picture(difference: ArrayLike, limit: float, margin: int = 0) -> str:
-    """Return a signed difference in blue (-limit) through white (0) to red (+limit)."""
+    """Return a signed difference in blue (-limit) through white (0) to red (+limit), as the text of a PNG data URI.
+
+    difference : (n, n)
+    limit : of the colours
+    margin : cells that are cut off at each border
+
+    >>> difference_picture(np.zeros((9, 9)), 0.1)[:14]
+    'data:image/png'
+    """
     values = np.asarray(difference, float)
     if margin:
         values = values[margin:-margin, margin:-margin]

@@ -184,10 +184,17 @@ def mean_std(levels: Sequence[MeasuredLevel], name: str) -> FloatArray:
 
 
 def mean_ratio(x: FloatArray, y: FloatArray, std: FloatArray, slope: Measured) -> float | None:
-    """Return the mean of y / x (levels,), where it or the single levels contradict the line y = `slope` x by more than
-    the noise `std` (levels,) of y; None where they don't.
+    """Return the mean of y / x, where it or the single levels contradict the line y = `slope` x; None where they don't.
+
+    x, y : (levels,)
+    std : standard deviations of y by noise, (levels,)
+    slope : fitted to the same levels, weighted by noise
 
     It is the slope of the same line with equal relative weights: where y is proportional to x, both are the same.
+
+    >>> x = np.array([1.0, 2.0, 3.0, 4.0])
+    >>> mean_ratio(x, 0.5 * x, np.full(4, 0.01), Measured(0.5, 0.01)) is None
+    True
     """
     chosen = x > LEAST_SIGNAL * np.max(x, initial=0.0)
     if np.count_nonzero(chosen) < 3:

@@ -214,7 +214,11 @@ def _least(loss: Callable[[FloatArray], float], start: FloatArray) -> tuple[floa
 
 
 def scatter_remarks(scatter: Scatter) -> list[str]:
-    """Say in a line what scatter there is, where it is clear."""
+    """Return a line on the scatter of the signals beyond their stated standard deviations, where it is clear.
+
+    >>> scatter_remarks(Scatter())
+    []
+    """
     if scatter.log_ratio < CLEAR_LOG_RATIO:
         return []
     shares = [
