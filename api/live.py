@@ -14,7 +14,7 @@ from functools import partial
 import anyio
 
 from api.errors import Conflict
-from api.safety import KnownSafety, StationSafety, key_of
+from api.safety import KnownSafety, StationSafety, shutter_key
 from lab.calibration.life import check_certified
 from lab.capture.blocking_calls import in_thread
 from lab.capture.plan import CapturePlan, full_plan
@@ -360,10 +360,10 @@ class LiveSessions:
         under way shares it, as a second connection would be refused.
         """
         with self._asking:
-            under_way = self._asked.get(key_of(station))
+            under_way = self._asked.get(shutter_key(station))
             if under_way is None or under_way.done():
                 self.safety.note_asked(station)
-                under_way = self._asked[key_of(station)] = in_thread(partial(self._make_safe, station, session_id))
+                under_way = self._asked[shutter_key(station)] = in_thread(partial(self._make_safe, station, session_id))
             return under_way
 
     def _make_safe(self, station: Station, session_id: str) -> None:

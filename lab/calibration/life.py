@@ -584,7 +584,7 @@ def _significance(a: Figure, b: Figure) -> float:
         ComparedNumbers(figure.name, np.array([figure.value]), np.array([figure.std]), sensor=figure.sensor)
         for figure in (a, b)
     )
-    at_same_temperature, std = two.beside(first)
+    at_same_temperature, std = two.at_temperature_of(first)
     difference = float(at_same_temperature.value[0]) - a.value
     if std[0] == 0.0:
         return 0.0 if difference == 0.0 else sigma_of_probability(0.0)
