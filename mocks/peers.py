@@ -640,7 +640,7 @@ def basler() -> Peer:
 
 
 def gentl() -> Peer:
-    """Return the camera that a GenTL producer simulates."""
+    """Return the camera that GenICam's own GenTL producer simulates."""
     return VikyCamera()
 
 
@@ -702,7 +702,7 @@ def prompt_stage() -> Peer:
 
 
 def browser_display() -> Peer:
-    """Return a browser that shows the display's page."""
+    """Return the display's page as a client without a browser asks for it."""
     return DisplayPeer()
 
 

@@ -416,6 +416,7 @@ def build_recording_set(
     options : as they were stated on the command line
     capture : keys of the capture
     notes : remarks of the import
+    spectra : by the path under which the capture names them
     """
     stored = f"frames/{capture['id']}.npy"
     manifest = Manifest.model_validate(
