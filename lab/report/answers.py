@@ -328,7 +328,11 @@ def proofs(fit: FitResult, diagnosis: DiagnosisResult | None, both: BothModels |
 
 
 def strip(fit: FitResult) -> list[tuple[str, list[KeyFigure]]]:
-    """Return the key figures of the first screen: by side, then those of the stereo pair."""
+    """Return the key figures of the first screen: by side, then those of the stereo pair.
+
+    >>> strip(FitResult(source="my-camera", cameras={}))
+    []
+    """
     rows = [
         (
             str(side),

@@ -249,7 +249,16 @@ class TapFiles(ImageFiles):
 
 
 def parse_taps(listed: Any, where: str) -> tuple[Tap, ...]:
-    """Return the taps that `[[taps]]` of a camera file lists, checked."""
+    """Return the taps that `[[taps]]` of a camera file lists, checked.
+
+    listed : tables with `name`, `region` and `overscan`
+    where : beginning of the message
+
+    Raises InputError for a table that isn't a tap, and for a name that two have.
+
+    >>> parse_taps([{"name": "A", "region": [0, 0, 10, 10]}], "camera.toml")[0].name
+    'A'
+    """
     try:
         taps = tuple(Tap.model_validate(item) for item in listed)
     except (ValidationError, TypeError) as error:
