@@ -31,9 +31,9 @@ def locate(root: Path, path: str) -> Path:
     pure = PurePosixPath(path)
     if not path or "\\" in path or pure.is_absolute() or (len(path) > 1 and path[1] == ":"):
         raise InputError("not a path relative to the folder with '/'; move the file into the folder and name it so")
-    found = root / pure
+    file = root / pure
     try:
-        inside, exists, is_file = found.resolve().is_relative_to(root.resolve()), found.exists(), found.is_file()
+        inside, exists, is_file = file.resolve().is_relative_to(root.resolve()), file.exists(), file.is_file()
     except (OSError, ValueError, RuntimeError) as error:  # a loop of links, a NUL, a name too long
         raise InputError(f"no usable path ({one_line(error)}); rename the file") from error
     if not inside:
@@ -44,27 +44,27 @@ def locate(root: Path, path: str) -> Path:
         raise InputError(f"no such file{near}; add it, or take what needs it out of the manifest")
     if not is_file:
         raise InputError("not a file; name the file itself")
-    if not os.access(found, os.R_OK):
+    if not os.access(file, os.R_OK):
         raise InputError(
             "can't be read (Permission denied); run it as the user to whom it belongs, or have its permissions changed"
         )
-    return found
+    return file
 
 
 def _in_other_case(root: Path, path: PurePosixPath) -> list[str]:
     """Return the paths below `root` that differ from `path` by capitals alone."""
-    found = [root]
+    reached = [root]
     for part in path.parts:
         if part == "..":
             return []
-        found = [
+        reached = [
             entry
-            for folder in found
+            for folder in reached
             if folder.is_dir()
             for entry in folder.iterdir()
             if entry.name.casefold() == part.casefold()
         ]
-    return [entry.relative_to(root).as_posix() for entry in found]
+    return [entry.relative_to(root).as_posix() for entry in reached]
 
 
 def locate_as_written(root: Path, path: str) -> tuple[Path, str | None]:
