@@ -156,5 +156,7 @@ def _is_serial(made: Any) -> bool:
 
     if not (inspect.isclass(made) and issubclass(made, WireInstrument) and not issubclass(made, Stage)):
         return False
+    if not made.on_a_port:
+        return False
     needed = [p for p in inspect.signature(made).parameters.values() if p.default is p.empty]
     return [parameter.name for parameter in needed] == ["address"]

@@ -10,6 +10,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import ClassVar
 
 import serial
 
@@ -26,13 +27,13 @@ from drivers.errors import (
 from drivers.instrument import Instrument, Recorder
 
 #: Longest time between two looks at whether `interrupt` was called.
-_SLICE_S = 0.05
+SLICE_S = 0.05
 #: Within an answer characters follow each other: a pause of this length is where it broke off.
 BETWEEN_S = 1.0
 #: What the system says of a port that another program, or another driver of this one, holds.
 _IN_USE = {errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY}
 #: More than any instrument here says at once: what babbles on is not ours.
-_LONGEST_ANSWER = 1 << 20
+LONGEST_ANSWER = 1 << 20
 
 
 def shown(data: bytes) -> str:
@@ -158,7 +159,7 @@ class Transport:
             at = self._received.find(end)
             if at >= 0:
                 return self._take(at + len(end))
-            if len(self._received) > _LONGEST_ANSWER:
+            if len(self._received) > LONGEST_ANSWER:
                 raise Garbled(f"{self.name}: sends without end; check that the right instrument is at this address")
             self._fill(deadline, asked)
 
@@ -191,7 +192,7 @@ class Transport:
             if self._heeds and self._interrupted.is_set():
                 raise self._stopped(asked)
             left = end - time.monotonic()
-            if self._receive(max(0.0, min(_SLICE_S, left))):
+            if self._receive(max(0.0, min(SLICE_S, left))):
                 return
             if left <= 0:
                 question = f" to {asked!r}" if asked else ""
@@ -239,6 +240,9 @@ def _number_of(error: BaseException) -> int | None:
 
 class WireInstrument(Instrument):
     """An instrument on a `Transport`: one conversation at a time, and a new connection after one that failed."""
+
+    #: Whether its address is a serial port or TCP, where whoever looks for instruments may knock.
+    on_a_port: ClassVar[bool] = True
 
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
