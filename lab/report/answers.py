@@ -67,7 +67,11 @@ def _from_zero(value: ParameterValue, quantity: Quantity | None) -> str:
 
 def odds(diagnosis: DiagnosisResult | None) -> list[tuple[Side, list[tuple[str, float]]]]:
     """Return the probabilities of the models by side: the likeliest sets of effects, none further acting, and all the
-    rest; and the rivals, where these aren't among the sets."""
+    rest; and the rivals, where these aren't among the sets.
+
+    >>> odds(None)
+    []
+    """
     likeliest_sets = []
     for models in diagnosis.models if diagnosis is not None else ():
         shown = models.sets[:ODDS]

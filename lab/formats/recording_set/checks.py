@@ -112,12 +112,17 @@ def _comparable(dark: FrameLevel, flat: FrameLevel) -> bool:
 
 
 def moved_rows(levels: Sequence[FrameLevel]) -> Iterator[str]:
-    """One line for each series of darks and flats whose frames fit the lights of the rows beside them, from one row on
-    to the end.
+    """Yield a line for each series of darks and flats whose frames fit the lights of the rows beside them, from a row
+    on.
 
-    `levels` in the order of their rows, darks with a light of 0. Means are fitted by a line in the light, as listed and
-    with the frames of the last rows moved by one. Series whose light grows by equal steps or factors fit either way
-    without darks and repeats; nothing is told of them."""
+    levels : in the order of their rows, darks with a light of 0
+
+    Means are fitted by a line in the light, as listed and with the frames of the last rows moved by one. Series whose
+    light grows by equal steps or factors fit either way without darks and repeats; nothing is reported of them.
+
+    >>> list(moved_rows([]))
+    []
+    """
     for gain_db, scale in dict.fromkeys((level.gain_db, level.scale) for level in levels if level.scale is not None):
         lit_levels = [
             level
