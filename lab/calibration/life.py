@@ -347,6 +347,12 @@ def calibrations(store: Store, after: str | None = None, limit: int | None = Non
 
     after : id of the calibration that they follow in this order
     limit : how many at most
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     calibrations(Store(Path(folder)))
+    []
     """
     register(store)
     asked = _select_rows().order_by(CalibrationRow.created.desc(), CalibrationRow.id.desc()).limit(limit)

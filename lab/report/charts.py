@@ -822,9 +822,9 @@ def residual_curve(curve: ResidualCurve) -> Figure:
     """Draw one measurement with both models' predictions, and below it the residuals in standard deviations.
 
     >>> from lab.formats.results.diagnosis import ResidualCurve
-    >>> curve = ResidualCurve(side="left", measurement="slanted_edge", label="edge-1", channel="G", axis="spatial frequency, cy/px",
-    ...     x=(0.1, 0.2), measured=(0.9, 0.8), measured_std=(0.01, 0.01), before=(0.95, 0.85), after=(0.9, 0.8),
-    held_out=True)
+    >>> curve = ResidualCurve(side="left", measurement="slanted_edge", label="edge-1", channel="G",
+    ...     axis="spatial frequency, cy/px", x=(0.1, 0.2), measured=(0.9, 0.8), measured_std=(0.01, 0.01),
+    ...     before=(0.95, 0.85), after=(0.9, 0.8), held_out=True)
     >>> len(residual_curve(curve)["data"]) >= 3
     True
     """

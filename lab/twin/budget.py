@@ -159,8 +159,15 @@ def parse_uses(text: str) -> tuple[str, ...]:
 def budget(
     content: CameraFile, uses: tuple[str, ...], station: Station | None = None, times: StepTimes | None = None
 ) -> BudgetResult:
-    """Return the budget of every use, and with a `station` what its sequences would make of it, at the step `times`
-    that are known there. Raises InputError where the model states no uncertainties."""
+    """Return the budget of every use: the contributions of effects and parameters to the variance of its numbers.
+
+    content : a camera model with uncertainties
+    uses : names of `USES`
+    station : whose sequences are weighed by what each would reduce
+    times : how long the station's steps took, where that is known
+
+    Raises InputError where the model states no uncertainties.
+    """
     posterior = with_darks(posterior_of(content), content.camera)
     content = replace(content, effects=with_unnamed(content.effects, posterior))
     covariance = np.array(posterior.covariance)

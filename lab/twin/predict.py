@@ -99,7 +99,15 @@ def predict(
 
 def posterior_of(content: CameraFile) -> ModelPosterior:
     """Return how well the model's parameters are known: its posterior, else one of independent parameters by the
-    camera's `std`. Raises InputError where it states neither."""
+    camera's `std`. Raises InputError where it states neither.
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> try:
+    ...     posterior_of(default_camera())
+    ... except InputError as error:
+    ...     print("no uncertainties" in str(error))
+    True
+    """
     if content.posterior is not None:
         return content.posterior
     camera = content.camera

@@ -190,9 +190,19 @@ def likeliest_prior(
 def posterior_under_prior(
     wave: FloatArray, operator: FloatArray, value: FloatArray, std: FloatArray, prior: CurvePrior
 ) -> CurvePosterior:
-    """Return the posterior of S with value = operator S + noise under `prior`, straight lines free.
+    """Return the posterior of S with value = operator S + noise under a prior, straight lines free.
 
-    `operator` (n, m), `value`, `std` (n,) of the signals.
+    wave : wavelengths (m,), nm
+    operator : (n, m)
+    value, std : signals and their standard deviations, (n,)
+    prior : roughness and strength of the curve
+
+    >>> wave = np.arange(400.0, 701.0, 10.0)
+    >>> value = 0.5 + 0.001 * (wave - 550.0)  # a straight line
+    >>> prior = CurvePrior(np.ones(31), 1e-6, 0.0)
+    >>> posterior = posterior_under_prior(wave, np.eye(31), value, np.full(31, 1e-3), prior)
+    >>> bool(np.allclose(posterior.mean, value, atol=1e-6))
+    True
     """
     line = straight_lines(wave)
     rough = rough_root(wave, prior.shape, prior.fine_share)
