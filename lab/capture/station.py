@@ -280,10 +280,10 @@ def drivers_of(station: Station) -> Drivers:
     """Return the drivers that a station file names. Raises InputError for settings that a driver doesn't know,
     DeviceError if there is no such driver."""
 
-    def made(family: str, entry: Address | None) -> Any:
+    def make_driver(family: str, entry: Address | None) -> Any:
         return entry and _make(family, family, entry.driver, entry.address, entry.settings)
 
-    stage = made("stage", station.stage)
+    stage = make_driver("stage", station.stage)
     if stage is not None:
         stage.instruct({name: target.instruction for name, target in station.targets.items()})
     return Drivers(
@@ -292,9 +292,9 @@ def drivers_of(station: Station) -> Drivers:
             for side, entry in station.cameras.items()
         },
         stage=stage,
-        monochromator=made("monochromator", station.monochromator),
-        spectroradiometer=made("spectroradiometer", station.spectroradiometer),
-        display=made("display", station.display),
-        photodiode=made("photodiode", station.photodiode),
-        light_source=made("light_source", station.light_source),
+        monochromator=make_driver("monochromator", station.monochromator),
+        spectroradiometer=make_driver("spectroradiometer", station.spectroradiometer),
+        display=make_driver("display", station.display),
+        photodiode=make_driver("photodiode", station.photodiode),
+        light_source=make_driver("light_source", station.light_source),
     )

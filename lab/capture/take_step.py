@@ -117,10 +117,10 @@ def find_exposure(
     where a camera missed the level."""
     limits = instruments.limits
 
-    def bounded(exposure_s: float) -> float:
+    def clip_to_limits(exposure_s: float) -> float:
         return float(np.clip(exposure_s, limits.exposure_min_s, limits.exposure_max_s))
 
-    exposure_s = {side: bounded(start_s[side]) for side in instruments.cameras.cameras}
+    exposure_s = {side: clip_to_limits(start_s[side]) for side in instruments.cameras.cameras}
     levels: dict[Side, float] = {}
     before: tuple[dict[Side, float], dict[Side, float]] | None = None
     for _ in range(TRIES):
@@ -136,7 +136,7 @@ def find_exposure(
                 factor = 10.0
             else:
                 factor = wanted.level / level
-            following[side] = bounded(exposure_s[side] * factor)
+            following[side] = clip_to_limits(exposure_s[side] * factor)
         if following == exposure_s:
             break
         before, exposure_s = (exposure_s, levels), following

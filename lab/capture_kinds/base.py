@@ -75,7 +75,7 @@ class ByKind(Generic[M]):
             raise ValueError(f"unknown kind {kind!r} of {self.what}; the kinds are {', '.join(self.models)}")
         return self.models[kind].model_validate(document)
 
-    def _validated(self, value: Any) -> BaseModel:
+    def _validate(self, value: Any) -> BaseModel:
         if isinstance(value, BaseModel):
             if type(value) in self.models.values():
                 return value
@@ -86,7 +86,7 @@ class ByKind(Generic[M]):
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_plain_validator_function(
-            self._validated, serialization=core_schema.simple_ser_schema("any")
+            self._validate, serialization=core_schema.simple_ser_schema("any")
         )
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -278,7 +278,7 @@ class CaptureLimits(Frozen):
     flat_wavelength_nm: float | None = Field(default=None, gt=0)  # None: white light
 
     @model_validator(mode="after")
-    def _ordered(self) -> Self:
+    def _check_order(self) -> Self:
         if self.exposure_min_s > self.exposure_max_s:
             raise ValueError(
                 f"exposure_min_s: {self.exposure_min_s:g} s is above exposure_max_s, {self.exposure_max_s:g} s; "

@@ -145,7 +145,7 @@ def page_environment() -> jinja2.Environment:
         trim_blocks=True,
     )
 
-    def stated(value: float | None, unit: str) -> str:
+    def format_stated(value: float | None, unit: str) -> str:
         return "" if value is None else format_value(value, None, unit)
 
     environment.filters |= {
@@ -155,7 +155,7 @@ def page_environment() -> jinja2.Environment:
         "at_beginning": at_beginning,
         "parameter_name": words.parameter_name,
         "parameter_value": words.parameter_value,
-        "stated": stated,
+        "stated": format_stated,
         "stated_as": lambda value, std, unit: "–" if value is None else format_value(value, std, unit),
         "still": still,
         "setting": told,

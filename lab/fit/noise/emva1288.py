@@ -104,7 +104,7 @@ class EmvaLevels:
             np.array([plane.temporal_variance_std for plane in bright]), given.variance_error * self.variance
         )
         # The dark of the same exposure where there is one, else the line through all darks
-        self.source = [self._taken(level.exposure_s) for level in self.flats]
+        self.source = [self._find_dark(level.exposure_s) for level in self.flats]
         self.below_mean = self.dark_at_levels(self.dark_mean, self.mean_line)
         self.below_variance = self.dark_at_levels(self.dark_variance, self.variance_line)
         self.signal = self.mean - self.below_mean
@@ -112,7 +112,7 @@ class EmvaLevels:
         self.light_mean_std = np.hypot([plane.mean_std for plane in bright], lamp_error * self.signal)
         self.signal_std = np.hypot(self.light_mean_std, self.dark_at_levels(self.dark_mean_std, None))
 
-    def _taken(self, exposure_s: float) -> int | None:
+    def _find_dark(self, exposure_s: float) -> int | None:
         if not self.dark_exposure.size:
             return None
         nearest = int(np.argmin(np.abs(self.dark_exposure - exposure_s)))
