@@ -44,12 +44,12 @@ def make_station_safe(
         shutter: Shutter = "none" if station.monochromator is None else "unknown"
         return SafeState(shutter=shutter, complaints=(str(error),), at=now())
 
-    def note_reached(driver: Instrument) -> None:
+    def shut_and_connect(driver: Instrument) -> None:
         if isinstance(driver, Monochromator) and driver.shut_at_once():
             on_shut()
         driver.connect()
 
-    states, until = made_safe(drivers, note_reached, on_shut), time.monotonic() + STOP_S
+    states, until = made_safe(drivers, shut_and_connect, on_shut), time.monotonic() + STOP_S
     closing = [in_thread(driver.close) for driver in drivers.all.values()]
     for done in closing:
         try:
