@@ -89,7 +89,7 @@ def _self_test(name: str, instrument: Instrument, sheet: DataSheet | None = None
             contract = CONTRACTS[name.split(maxsplit=1)[0]]
             contract.everyday(instrument)
             instrument.stop()
-            contract.is_safe(instrument)
+            contract.require_safe(instrument)
             works, words = True, "works, and is in its safe state"
             if sheet is not None and isinstance(instrument, Camera):
                 difference = contradiction(name.partition(" ")[2], instrument.sensor(), sheet)
