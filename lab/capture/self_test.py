@@ -42,7 +42,7 @@ def self_tests(drivers: Drivers, sheets: Mapping[str, DataSheet] = MappingProxyT
     """Connect to each instrument, bring it into its safe state, use it once for its purpose, check that it is safe, and
     disconnect.
 
-    `sheets`: the cameras' data sheets by side, held against what the cameras say.
+    `sheets`: the cameras' data sheets by side, compared with what the cameras report.
     """
     for name, instrument in drivers.all.items():
         yield _self_test(name, instrument, sheets.get(name.partition(" ")[2]))

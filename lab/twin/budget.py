@@ -181,7 +181,7 @@ def budget(
 
 
 def with_darks(posterior: ModelPosterior, camera: CameraModel) -> ModelPosterior:
-    """Return a posterior with what dark frames tell of the read noise beside it: a diagnosis knows that by the photon
+    """Return a posterior to which dark frames add their read noise: a diagnosis knows that by the photon
     transfer's intercept alone. Two frames of N pixels measure the dark's variance to sqrt(2 / N), and to
     `DARK_VARIANCE_FLOOR`."""
     if "read" not in posterior.names:

@@ -338,7 +338,7 @@ def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Tabl
 
 
 def _fit_curves(lights: Sequence[_TableLight], channels: Sequence[str], remarks: list[str]) -> SpectralFit:
-    """Fit the curves of `channels` to the lights; `remarks` gets what is to be told. Raises `NotDetermined`."""
+    """Fit the curves of `channels` to the lights; `remarks` gets what is to be reported. Raises `NotDetermined`."""
     by_channel = {c: [light for light in lights if light.channel == c] for c in channels}
     for channel, channel_lights in by_channel.items():
         if len({light.wavelength_nm for light in channel_lights}) < MIN_SPECTRA:

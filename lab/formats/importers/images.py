@@ -134,8 +134,9 @@ class ImageFiles(FolderFiles):
 
 
 def read_sides(file: Path) -> dict[Side, dict[str, Any]]:
-    """Return what `camera.toml` says of each side: its keys at the top are of a single (left) camera, or of every side
-    where it has the tables `[left]` and `[right]`. A missing file says nothing of the left one."""
+    """Return what `camera.toml` states of each side: its keys at the top are of a single (left) camera, or of every
+    side where it has the tables `[left]` and `[right]`. A missing file says nothing of the left one.
+    """
     written: dict[str, Any] = {}
     if file.is_file():
         try:

@@ -472,7 +472,7 @@ def _pages(file: Path) -> int:
 
 
 def _by_row(lines: Sequence[str], numbers: Sequence[int]) -> list[str]:
-    """Lines on captures as lines on their rows, one for all rows of which the same is said."""
+    """Lines on captures as lines on their rows, one for all rows that share a text."""
     rows_of_line: dict[tuple[str, str], list[str]] = {}
     for line in lines:
         parts = re.fullmatch(r"(.*: )captures\[(\d+)\]( \(.*?\))?(: .*)", line, re.S)
