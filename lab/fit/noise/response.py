@@ -110,8 +110,8 @@ def full_well(evaluation: Evaluation) -> tuple[float | None, float | None]:
     limit = evaluation.levels.white_dn - evaluation.dark.lines[name].black
     if value >= limit - 0.5 * evaluation.levels.step_dn:
         evaluation.remarks.add(
-            f"saturation is the converter's limit ({evaluation.levels.white_dn:g} DN): full_well_e is the signal there, "
-            "and the pixel may hold more"
+            f"saturation is the converter's limit ({evaluation.levels.white_dn:g} DN): full_well_e is the signal "
+            "there, and the pixel may hold more"
         )
     # The saturated value is rounded to the step of the codes
     return in_electrons(evaluation, value, np.sqrt(evaluation.levels.quantisation_dn2))
