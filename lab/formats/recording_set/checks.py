@@ -462,7 +462,7 @@ def _check_frames(recordings: RecordingSet, findings: Findings, loaded: Loaded) 
     for number, capture in enumerate(captures, start=1):
         camera = recordings.manifest.cameras[capture.side]
         try:
-            frame = recordings.frame(capture)
+            frame = recordings.whole_frame(capture)
         except InputError as error:
             findings.problems.append(str(error))
             continue

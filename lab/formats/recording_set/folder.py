@@ -116,7 +116,7 @@ def contents(recordings: RecordingSet) -> Iterator[tuple[str, bytes]]:
     for capture in recordings.manifest.captures:
         if capture.frame not in written:
             written.add(capture.frame)
-            yield capture.frame, _frame_content(recordings, capture.frame, recordings.frame(capture))
+            yield capture.frame, _frame_content(recordings, capture.frame, recordings.whole_frame(capture))
     yield from _rest(recordings)
     yield MANIFEST, manifest_json(recordings.manifest).encode()
 
