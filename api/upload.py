@@ -158,7 +158,7 @@ class Inbox:
                 notes = name_as_in_archive(recordings.manifest.notes, place)
                 recordings = recordings.under(recordings.manifest.model_copy(update={"notes": notes}))
                 warnings: list[str] = []
-                recording.write(recordings, unpacked, told=warnings.extend)
+                recording.write(recordings, unpacked, report_warnings=warnings.extend)
                 recordings.warnings += tuple(warnings)
         except InputError as error:
             raise InputError(name_as_in_archive(str(error), place)) from None

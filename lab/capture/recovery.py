@@ -101,7 +101,7 @@ class Recovery:
         self._looked.wait(patience_s)
 
     def resume_with(
-        self, resume: Callable[[str], None], note: Callable[[Station, SafeState], None] = lambda station, found: None
+        self, resume: Callable[[str], None], note: Callable[[Station, SafeState], None] = lambda station, state: None
     ) -> None:
         """Set the functions that resume a session and that keep what a station's instruments have answered; sessions
         that waited are resumed now."""

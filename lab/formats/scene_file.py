@@ -282,10 +282,10 @@ def scene(
         with _about(file):
             return PictureOnScreen.choose(parameters).show(codes, view, white)
     if suffix in CUBES:
-        weights, own = _weights(suffix, parameters or {})
+        weights, chosen = _weights(suffix, parameters or {})
         image = read_cube(file, white, weights)
         with _about(file):
-            return Cube.choose(own).show(image, view)
+            return Cube.choose(chosen).show(image, view)
     raise InputError(
         f"scene {name!r} is not known: name one of {', '.join(scenes())}, a picture ({' '.join(PICTURES)}) or a cube "
         f"({' '.join(CUBES)})"

@@ -18,7 +18,7 @@ from lab.effect_titles import at_beginning, effect_title
 from lab.errors import cannot_write
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
-from lab.formats.recording_set.manifest import told
+from lab.formats.recording_set.manifest import format_setting
 from lab.formats.result_file import Provenance, installed_versions, provenance_of
 from lab.formats.results import (
     Check,
@@ -158,7 +158,7 @@ def page_environment() -> jinja2.Environment:
         "stated": format_stated,
         "stated_as": lambda value, std, unit: "–" if value is None else format_value(value, std, unit),
         "still": still,
-        "setting": told,
+        "setting": format_setting,
         "mood": diagnosis_page.mood,
     }
     return environment

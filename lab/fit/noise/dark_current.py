@@ -129,8 +129,8 @@ def read_noise(evaluation: Evaluation) -> tuple[float | None, float | None]:
             )
         return None, None
     count = t.floor.size
-    own = t.covariance[2:, 2:]
-    weight = 1.0 / np.diag(own)
+    floor_covariance = t.covariance[2:, 2:]
+    weight = 1.0 / np.diag(floor_covariance)
     weight /= weight.sum()
     floor = float(weight @ t.floor)
     if floor < evaluation.levels.hidden_dn2:
@@ -140,7 +140,7 @@ def read_noise(evaluation: Evaluation) -> tuple[float | None, float | None]:
             f"{0.4 * evaluation.levels.step_dn / t.gain:.2f} e; a higher gain would show it"
         )
         return None, None
-    between = float(np.sum((t.floor - floor) ** 2 / np.diag(own)))
+    between = float(np.sum((t.floor - floor) ** 2 / np.diag(floor_covariance)))
     gradient = np.zeros(2 + count)
     noise = float(np.sqrt(floor - evaluation.levels.quantisation_dn2))
     gradient[0] = -noise / t.gain**2

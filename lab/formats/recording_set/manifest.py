@@ -83,7 +83,7 @@ def _changed(name: str, before: InstrumentSnapshot, now: InstrumentSnapshot) -> 
             continue
         was, is_now = before.settings.get(key), now.settings.get(key)
         if not _same(was, is_now):
-            yield f"{name}: {key} was {told(was)}, is {told(is_now)}"
+            yield f"{name}: {key} was {format_setting(was)}, is {format_setting(is_now)}"
 
 
 def _same(was: Value | None, is_now: Value | None) -> bool:
@@ -92,7 +92,7 @@ def _same(was: Value | None, is_now: Value | None) -> bool:
     return was == is_now
 
 
-def told(value: Value | None) -> str:
+def format_setting(value: Value | None) -> str:
     """Return a setting's value in words."""
     return "not there" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
