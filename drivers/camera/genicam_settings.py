@@ -211,7 +211,11 @@ RECORDED = (
 
 def set_if_there(features: Features, name: str, value: Setting) -> None:
     """Set a feature that the camera has, an enumeration's entry that it offers; some can't be written, and have the
-    value already."""
+    value already.
+
+    features : of the camera
+    name, value : of the feature
+    """
     if not features.has(name) or (isinstance(value, str) and value not in features.entries(name)):
         return
     try:

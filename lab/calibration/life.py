@@ -366,7 +366,14 @@ def calibrations(store: Store, after: str | None = None, limit: int | None = Non
 
 
 def count_calibrations(store: Store) -> int:
-    """Return how many calibrations there are."""
+    """Return how many calibrations there are.
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     count_calibrations(Store(Path(folder)))
+    0
+    """
     register(store)
     with store.reading() as db:
         return db.scalars(sa.select(sa.func.count()).select_from(CalibrationRow)).one()

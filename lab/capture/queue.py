@@ -34,7 +34,14 @@ class QueuedSession(Frozen):
 
 
 def queue(store: Store) -> list[QueuedSession]:
-    """Return the queued sessions in their order."""
+    """Return the queued sessions in their order.
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     queue(Store(Path(folder)))
+    []
+    """
     with store.reading() as db:
         return [
             QueuedSession(
