@@ -63,7 +63,7 @@ def count_events(dataset: Dataset) -> list[_Events]:
         # few pixels exceed what the least noise asks for: the median of the others isn't needed
         lowest = max(BRIGHT * float(np.sqrt(moving)), LEAST_STEPS * dataset.step_dn)
         row, col = np.nonzero(highest - second > lowest)
-        usual = np.median(frames[:, row, col], axis=0)
+        usual = np.asarray(np.median(frames[:, row, col], axis=0), float)
         hit = highest[row, col] - second[row, col] > _least_dn(dataset, moving, usual)
         row, col, usual = row[hit], col[hit], usual[hit]
         typical = np.median(np.array([sampled(frame) for frame in frames]), axis=0)

@@ -217,9 +217,9 @@ def _powers(image: FloatArray, lines: Lines) -> tuple[FloatArray, FloatArray]:
     pixels, count = image.shape
     image = _without_light(image)
     window = _window(count)
-    table = np.square(np.abs(np.fft.fft(np.fft.rfft(image * window, axis=1), axis=0))) / image.size
+    spectrum = np.fft.fft(np.fft.rfft(np.asarray(image * window, np.float32), axis=1), axis=0)
     along = np.array(_along(pixels))
-    white = np.concatenate([table[along], table[-along]])
+    white = np.square(np.abs(np.concatenate([spectrum[along], spectrum[-along]])), dtype=float) / image.size
     line = np.square(np.abs(np.fft.rfft(_without_repeats(image.mean(axis=0), lines) * window))) * pixels / count
     bands = _bands(count)
     of_lines, of_pixels = (np.array([power[..., band].mean() for band in bands]) for power in (line, white))
