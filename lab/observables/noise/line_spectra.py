@@ -16,6 +16,9 @@ from sim.spectrum import FloatArray
 
 BAND_PIXELS = 1_500_000  # of a band of a large image: they tell the level to 0.4 %, as the numbers that use it say
 LEVEL_BAND = 0.04, 0.2  # cy/px, along both axes: frequencies over which the power of white noise is averaged
+#: Powers above this multiple of the level are tones, and no part of it. Powers of noise are exponentially distributed:
+#: a share exp(-16) = 1e-7 is above, with 17 exp(-16) = 2e-6 of the power.
+LARGEST_POWER = 16.0
 
 
 @dataclass(frozen=True)
@@ -33,11 +36,13 @@ class _Powers:
         return cls(table, fft.fftfreq(image.shape[0]), fft.rfftfreq(image.shape[1]))
 
     def in_level_band(self) -> FloatArray:
-        """Return the powers in `LEVEL_BAND`."""
+        """Return the powers in `LEVEL_BAND`, without those of tones."""
         low, high = LEVEL_BAND
         rows = (np.abs(self.rows) >= low) & (np.abs(self.rows) <= high)
         cols = (self.cols >= low) & (self.cols <= high)
-        return np.asarray(self.table[np.ix_(rows, cols)].ravel(), float)
+        powers = np.asarray(self.table[np.ix_(rows, cols)].ravel(), float)
+        # the median of an exponential distribution is ln 2 of its mean
+        return powers[powers <= LARGEST_POWER / np.log(2.0) * np.median(powers)]
 
 
 @dataclass(frozen=True)
