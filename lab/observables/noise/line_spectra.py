@@ -101,13 +101,13 @@ def periodogram(image: Image) -> Periodogram:
         powers: dict[Lines, _Powers] = {"rows": whole, "columns": whole}
         level = whole.in_level_band()
     else:
-        of_rows, of_cols = _middle(rows, BAND_PIXELS // cols), _middle(cols, BAND_PIXELS // rows)
+        of_rows, of_cols = middle(rows, BAND_PIXELS // cols), middle(cols, BAND_PIXELS // rows)
         powers = {"rows": _Powers.of(image[of_rows]), "columns": _Powers.of(image[:, of_cols])}
         level = np.concatenate([of.in_level_band() for of in powers.values()])
     return Periodogram(means, powers, max(float(level.mean()), 1e-12), level.size)
 
 
-def _middle(size: int, wanted: int) -> slice:
+def middle(size: int, wanted: int) -> slice:
     """Return the middle `wanted` of `size` lines, and a few more where their transform is faster."""
     count = min(fft.next_fast_len(max(wanted, 2), real=True), size)
     return slice((size - count) // 2, (size - count) // 2 + count)
