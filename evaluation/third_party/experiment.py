@@ -70,6 +70,7 @@ SOURCES: dict[str, Source] = {
     "persistence_of_three_traps": Source("Pyxel", by_pyxel.PyxelPersistence.draw_several, "persistence"),
     "column_gain": Source("Pyxel", by_pyxel.Columns.draw, "column_gain"),
     "cosmic_rays": Source("Pyxel", by_pyxel.Protons.draw, "cosmic_rays"),
+    "charge_transfer_into_overscan": Source("Pyxel", by_pyxel.OverscanTransfer.draw, "charge_transfer_inefficiency"),
 }
 
 

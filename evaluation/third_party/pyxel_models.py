@@ -31,6 +31,7 @@ from pyxel.util import set_random_seed
 
 from evaluation.third_party.camera import DrawnCamera
 from evaluation.third_party.models import SimulatedSensor, SimulatorCheck
+from sim.sensor.margins import Margins
 from sim.spectrum import FloatArray
 
 #: Volts an electron, by which Pyxel's signals are read back.
@@ -92,6 +93,36 @@ class PyxelTransfer(SimulatedSensor):
         read = float(self._clock(frame)[n, n]) / 1000.0
         at_once = n * self.loss / np.exp(-1.0 / self.release_px)
         return SimulatorCheck(n * self.loss / (1.0 + at_once), 1.0 - read, 1e-6)
+
+
+@dataclass
+class OverscanTransfer(PyxelTransfer):
+    """The same in frames with 16 rows and columns of overscan, and without hot pixels: flats tell it by these lines."""
+
+    overscan_px: int = 16
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, camera: DrawnCamera) -> OverscanTransfer:
+        drawn = PyxelTransfer.draw(rng, camera)
+        return cls(drawn.truth, "usual", drawn.axis, drawn.loss, drawn.release_px, drawn.full_well_e)
+
+    @property
+    def margins(self) -> Margins:
+        return Margins(overscan_rows=(0, self.overscan_px), overscan_cols=(0, self.overscan_px))
+
+    def collect(self, mean_e: FloatArray, exposure_s: float, rng: np.random.Generator) -> FloatArray:
+        return self._clock(self.margins.surround(rng.poisson(mean_e).astype(float)))
+
+    def check(self) -> SimulatorCheck:
+        """Behind n lines of even light N, traps hold b g N / (1 + (1 - b) g), g = n loss / b. The overscan reads it but
+        for the share b^16: the extended pixel edge response. g grows by a hundredth from line to line."""
+        n = 100
+        frame = self.margins.surround(np.full((n, n), 1000.0))
+        read = np.moveaxis(self._clock(frame), self.axis, 0)
+        held = float(np.exp(-1.0 / self.release_px))
+        taken = (n - 1) * self.loss / held
+        wanted = taken * held / (1.0 + (1.0 - held) * taken) * (1.0 - held**self.overscan_px)
+        return SimulatorCheck(wanted, float(read[n:, n // 2].sum()) / 1000.0, 0.02 * wanted)
 
 
 @dataclass

@@ -109,19 +109,22 @@ class Trails:
         return read
 
     def _read_behind(self, packets: FloatArray, transfers: FloatArray, behind: int) -> FloatArray:
-        """Return what is read of the `behind` last lines of packets (lines, n), where traps are filled to the level of
-        each packet and keep the most that any has left them."""
+        """Return what is read of the `behind` last lines of packets (lines, n), where each packet has filled the traps
+        to its own level: n loss N, the most of all packets by what is left of it. Where all transfers act at once, a
+        packet N after traps that hold k of the one before fills them to g (N + k) / (1 + g)."""
         lines = np.arange(1.0, behind + 1.0)[:, None]
         before, total = packets[:-behind], packets[-behind:]
         for share, release in self.releases:
             held = float(np.exp(-1.0 / release))
-            left = -np.expm1(-self.loss * share * transfers[:-behind])
+            lost = self.loss * share * transfers[:-behind]
             if self.at_once:
-                left = self.loss * share * transfers[:-behind]
-                left = left / (1.0 + left / held)
-            age = np.arange(len(before) - 1.0, -1.0, -1.0)[:, None]
-            most = np.max(left * before * held**age, axis=0, initial=0.0)
-            total = total + most * (1.0 - held) * held ** (lines - 1.0)
+                left: FloatArray = np.zeros(before.shape[1])
+                for taken, packet in zip(lost / held, before, strict=True):
+                    left = held * np.maximum(left, taken * (packet + left) / (1.0 + taken))
+            else:
+                age = np.arange(len(before) - 1.0, -1.0, -1.0)[:, None]
+                left = np.max(lost * before * held**age, axis=0, initial=0.0)
+            total = total + left * (1.0 - held) * held ** (lines - 1.0)
         return total
 
     def _as_given(self, read: FloatArray) -> FloatArray:
