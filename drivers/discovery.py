@@ -44,7 +44,7 @@ class Found:
 
 
 def find_all(usbip: str = "") -> Iterator[Found]:
-    """Everything found: USB devices (and those that a USB/IP server `HOST[:PORT]` exports), cameras of installed
+    """Yield everything found: USB devices (and those that a USB/IP server `HOST[:PORT]` exports), cameras of installed
     libraries, serial ports."""
     yield from usb_devices()
     if usbip:
@@ -155,6 +155,8 @@ def _is_serial(made: Any) -> bool:
     from drivers.transport import WireInstrument
 
     if not (inspect.isclass(made) and issubclass(made, WireInstrument) and not issubclass(made, Stage)):
+        return False
+    if not made.on_a_port:
         return False
     needed = [p for p in inspect.signature(made).parameters.values() if p.default is p.empty]
     return [parameter.name for parameter in needed] == ["address"]

@@ -10,6 +10,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import ClassVar
 
 import serial
 
@@ -26,13 +27,13 @@ from drivers.errors import (
 from drivers.instrument import Instrument, Recorder
 
 #: Longest time between two looks at whether `interrupt` was called.
-_SLICE_S = 0.05
+SLICE_S = 0.05
 #: Within an answer characters follow each other: a pause of this length is where it broke off.
 BETWEEN_S = 1.0
 #: What the system says of a port that another program, or another driver of this one, holds.
 _IN_USE = {errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY}
 #: More than any instrument here says at once: what babbles on is not ours.
-_LONGEST_ANSWER = 1 << 20
+LONGEST_ANSWER = 1 << 20
 
 
 def shown(data: bytes) -> str:
@@ -142,21 +143,23 @@ class Transport:
         self._record("sent", data)
 
     def read(self, count: int, timeout_s: float | None = None, asked: str = "") -> bytes:
-        """Exactly `count` bytes. Raises `NoAnswer` with what was received instead, `Disconnected`, `Interrupted`."""
+        """Return exactly `count` bytes. Raises `NoAnswer` with what was received instead, `Disconnected`,
+        `Interrupted`.
+        """
         deadline = self._deadline(timeout_s)
         while len(self._received) < count:
             self._fill(deadline, asked)
         return self._take(count)
 
     def read_until(self, end: bytes, timeout_s: float | None = None, asked: str = "") -> bytes:
-        """Everything up to and including the next `end`. Raises `NoAnswer`, `Disconnected`, `Garbled` or
+        """Return everything up to and including the next `end`. Raises `NoAnswer`, `Disconnected`, `Garbled` or
         `Interrupted`."""
         deadline = self._deadline(timeout_s)
         while True:
             at = self._received.find(end)
             if at >= 0:
                 return self._take(at + len(end))
-            if len(self._received) > _LONGEST_ANSWER:
+            if len(self._received) > LONGEST_ANSWER:
                 raise Garbled(f"{self.name}: sends without end; check that the right instrument is at this address")
             self._fill(deadline, asked)
 
@@ -189,7 +192,7 @@ class Transport:
             if self._heeds and self._interrupted.is_set():
                 raise self._stopped(asked)
             left = end - time.monotonic()
-            if self._receive(max(0.0, min(_SLICE_S, left))):
+            if self._receive(max(0.0, min(SLICE_S, left))):
                 return
             if left <= 0:
                 question = f" to {asked!r}" if asked else ""
@@ -237,6 +240,9 @@ def _number_of(error: BaseException) -> int | None:
 
 class WireInstrument(Instrument):
     """An instrument on a `Transport`: one conversation at a time, and a new connection after one that failed."""
+
+    #: Whether its address is a serial port or TCP, where whoever looks for instruments may knock.
+    on_a_port: ClassVar[bool] = True
 
     def __init__(self, transport: Transport) -> None:
         self._transport = transport

@@ -1,16 +1,11 @@
-"""Effects in packages of their own: drafted as one, and checked by the contract of effects."""
+"""Effects in packages of their own, drafted from discovered laws."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from lab.diagnose.effect_draft import class_name, draft
-from lab.errors import InputError
 from lab.formats.results import DiscoveredLaw
-from sim.effect_contract import complaints
-from sim.effects.library import effects
-from sim.extensions import installed, refused
 
 PROJECT = """[build-system]
 requires = ["setuptools>=77"]
@@ -55,31 +50,3 @@ def drafted_package(law: DiscoveredLaw, number: int, source: str, folder: Path) 
         ),
         project,
     )
-
-
-def check_package(package: str) -> dict[str, tuple[str, ...]]:
-    """Run the contract of effects on those that a package adds.
-
-    package : its name, or that of one effect
-    Returns the complaints by effect. Raises InputError where no installed package adds one under that name.
-    """
-    wanted = _plain(package)
-    points = {
-        point.name
-        for point in installed("effects")
-        if wanted in (_plain(point.name), _plain(point.dist.name if point.dist is not None else ""))
-    }
-    if not points:
-        there = ", ".join(sorted(point.name for point in installed("effects"))) or "none"
-        raise InputError(
-            f"{package}: no installed package of that name adds an effect; installed are {there}: install it here, or "
-            "look at its entry points, group calibench.effects"
-        )
-    known = effects()
-    broken = {name: tuple(line for line in refused() if f"calibench.effects: {name}: " in line) for name in points}
-    return {name: broken[name] or complaints(known[name]) for name in sorted(points)}
-
-
-def _plain(name: str) -> str:
-    """Return a distribution's name as package indexes compare it."""
-    return re.sub(r"[-_.]+", "-", name).lower()

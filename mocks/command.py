@@ -77,6 +77,7 @@ INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
     "cr250": _mock("cr300", "ColorimetryResearch", "CR-250"),
     "cr300": _mock("cr300", "ColorimetryResearch", "CR-300"),
     "cs2000": _mock("cs2000", "MockCs2000"),
+    "spotread": _mock("spotread", "MockSpotread"),
     "scpi-meter": _mock("scpi_meter", "MockScpiMeter"),
     "pe4000": _mock("pe4000", "MockPe4000"),
     "stage": _mock("stage", "MockStage"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import shlex
 import shutil
 import signal
 import socket
@@ -38,6 +39,7 @@ from mocks.scpi_meter import AREA_M2, MockScpiMeter
 from mocks.scpi_meter import calibration_csv as diode_calibration
 from mocks.sp2150 import MockSp2150
 from mocks.specbos1211 import MockSpecbos1211
+from mocks.spotread import MockSpotread
 from mocks.stage import MockStage
 from mocks.tethered import TetheredCamera, write_dng
 from mocks.usb import UsbIpServer, stereo_pair
@@ -599,6 +601,19 @@ def sp2150() -> Peer:
 
 def specbos1211() -> Peer:
     return LinePeer(MockSpecbos1211, slowness=5.0, timeout_s=0.5, fetch_timeout_s=0.5, measure_timeout_s=2.0)
+
+
+def argyll() -> Peer:
+    peer = LinePeer(MockSpotread, tcp=True, timeout_s=5.0, measure_timeout_s=3.0)
+    peer.settings["program"] = spotread_command(peer.address)
+    peer.address = "1"
+    return peer
+
+
+def spotread_command(address: str) -> str:
+    """Return the program that stands in for spotread: `program` of the driver. `address`: of its mock, by TCP."""
+    file = Path(__file__).with_name("spotread_program.py")
+    return shlex.join([sys.executable, "-I", "-S", str(file), address.removeprefix("socket://")])
 
 
 def pr655() -> Peer:

@@ -1,5 +1,6 @@
 """What other packages add, by entry points: `calibench.effects`, `calibench.observables`, `calibench.importers`,
-`calibench.capture_kinds`, `calibench.illuminants`, `calibench.commands`. Drivers have a registry of their own.
+`calibench.capture_kinds`, `calibench.illuminants`, `calibench.charts`, `calibench.commands`. Drivers have a registry of
+their own.
 
 An extension that can't be loaded, or isn't what its group asks for, is one line in the log and stops nothing.
 """
@@ -11,7 +12,7 @@ from collections.abc import Iterator
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
-Group = Literal["effects", "observables", "importers", "capture_kinds", "illuminants", "commands"]
+Group = Literal["effects", "observables", "importers", "capture_kinds", "illuminants", "charts", "commands"]
 log = logging.getLogger(__name__)
 _refused: dict[tuple[str, str], str] = {}
 

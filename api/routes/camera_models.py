@@ -9,12 +9,12 @@ from typing import Annotated
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
-from api.archives import ARCHIVE, Form, Packed, sent
+from api.archives import ARCHIVE, Form, Packed, stream_archive
 from api.errors import Conflict, answers
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import CameraModels, Comparison
 from api.security import REPORT_POLICY
-from api.sending import BODY, arrived
+from api.sending import BODY, receive_archive
 from api.service import CALIBRATE, READ, Here, HexId, Service, camera_model
 from api.upload import take_cameras
 from lab.calibration import camera_models, life
@@ -68,7 +68,7 @@ async def send_camera_model(service: Here, request: Request, response: Response)
     """Send in camera files, left.toml or right.toml or both, with the arrays that they name beside them, as a .zip,
     .tar or .tar.gz. Each is read completely before it is kept. A traced lens is sent as its table, for no lens is
     traced here."""
-    async with arrived(service, request, service.limits.model_bytes) as came:
+    async with receive_archive(service, request, service.limits.model_bytes) as came:
         content = await asyncio.to_thread(take_cameras, came.place, came.archive, service.limits.model_bytes)
         id = await asyncio.to_thread(camera_models.bring_in, service.store, content)
     response.headers["Location"] = f"/api/v1/camera-models/{id}"
@@ -108,7 +108,7 @@ def camera_model_archive(service: Here, model_id: HexId, form: Form) -> Response
     if not record.sides:
         raise Conflict(f"camera model {model_id}: no camera file was kept; fit again")
     files = list(camera_models.files(service.store, model_id))
-    return sent(packed(((file.name, file.read_bytes()) for file in files), form), f"camera-{model_id}", form)
+    return stream_archive(packed(((file.name, file.read_bytes()) for file in files), form), f"camera-{model_id}", form)
 
 
 Source = Annotated[
@@ -157,7 +157,7 @@ def _name_of(service: Service, id: str) -> str:
     return id
 
 
-def _compared(service: Service, a: str, b: str) -> ComparisonResult:
+def _compare(service: Service, a: str, b: str) -> ComparisonResult:
     return compare(_fit(service, "a", a), _fit(service, "b", b)).model_copy(update={"a": a, "b": b})
 
 
@@ -175,7 +175,7 @@ def compare_calibrations(
     ] = [],  # noqa: B006  (FastAPI copies it)
 ) -> Comparison:
     """Two calibrations: what changed beyond its uncertainty, as `calibench compare A B` tells it."""
-    result = _compared(service, a, b)
+    result = _compare(service, a, b)
     try:
         failed = failures(result, [FailRule.parse(rule) for rule in fail_on])
     except InputError as error:
@@ -192,5 +192,5 @@ def compare_calibrations(
 def comparison_page(service: Here, a: Source, b: Source) -> HTMLResponse:
     """The comparison with its pictures, one page that needs no network, as `calibench compare --report` writes it."""
     names = {"a": _name_of(service, a), "b": _name_of(service, b)}
-    page = render_comparison(_compared(service, a, b).model_copy(update=names))
+    page = render_comparison(_compare(service, a, b).model_copy(update=names))
     return HTMLResponse(service.public.within(page), headers={"Content-Security-Policy": REPORT_POLICY})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,7 +36,7 @@ commands = typer.Typer(
     help="The library of effects, and drafts of new ones from discovered laws. `calibench effects NAME` is "
     "`calibench effects list NAME`.",
 )
-#: `calibench check-effect`, which stands beside `calibench effects`.
+#: `calibench check-effect` and `calibench check-chart`, which stand beside `calibench effects`.
 check_command = typer.Typer()
 
 
@@ -134,13 +135,31 @@ def check_effect(
 
     Example: calibench check-effect calibench-effect-code-step
     """
-    from lab.effect_packages import check_package
+    from lab.extension_checks import check_effects
 
-    checked = check_package(package)
+    _tell_checked("effects", check_effects(package))
+
+
+@check_command.command("check-chart")
+def check_chart(
+    package: Annotated[
+        str, typer.Argument(metavar="PACKAGE", help="an installed package, or the name of a chart that one adds")
+    ],
+) -> None:
+    """Run the contract of charts on those of an installed package. Exit code 4 where one doesn't keep it.
+
+    Example: calibench check-chart calibench-chart-grey-scale
+    """
+    from lab.extension_checks import check_charts
+
+    _tell_checked("charts", check_charts(package))
+
+
+def _tell_checked(group: str, checked: Mapping[str, Sequence[str]]) -> None:
     for name, lines in checked.items():
         for line in lines:
             out.print(escape(f"{name}: {line}"))
-        out.print(escape(f"{name}: {f'{len(lines)} complaints' if lines else 'keeps the contract of effects'}"))
+        out.print(escape(f"{name}: {f'{len(lines)} complaints' if lines else f'keeps the contract of {group}'}"))
     if any(checked.values()):
         raise typer.Exit(EXIT_CHECK)
 

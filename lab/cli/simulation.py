@@ -187,12 +187,12 @@ def simulate(
 
 
 def _print_scenes() -> None:
-    from sim.scene.catalogue import SCENES
+    from sim.scene.catalogue import scenes
 
     table = Table(box=None, pad_edge=False)
     for heading in ("scene", "what it shows", "parameters (--set KEY=VALUE)"):
         table.add_column(heading)
-    for name, scene in SCENES.items():
+    for name, scene in scenes().items():
         keys = (f"{key}={scene.model_fields[key].default}" for key in scene.quantities())
         table.add_row(name, scene.shows, escape(" ".join(keys)))
     out.print(table)

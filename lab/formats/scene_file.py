@@ -21,7 +21,7 @@ from lab.formats.pictures import read_picture as read_samples
 from lab.formats.spectrum_csv import parse_curve
 from sim.camera import CameraModel
 from sim.scene import Scene, SpectralImage
-from sim.scene.catalogue import SCENES, Cube, PictureOnScreen, View, scene_by_name
+from sim.scene.catalogue import Cube, PictureOnScreen, View, scene_by_name, scenes
 from sim.scene.light import at_luminance, illuminant
 from sim.spectrum import FloatArray, Spectrum, energy_from_photons
 
@@ -263,14 +263,14 @@ def scene(
     distance_mm: float = 1000.0,
     parameters: Mapping[str, object] | None = None,
 ) -> Scene:
-    """Return a scene before a camera: one of `sim.scene.catalogue.SCENES` by its name, or a picture or a cube by its
+    """Return a scene before a camera: one of `sim.scene.catalogue.scenes()` by its name, or a picture or a cube by its
     file.
 
     `white`: radiance of a perfect white diffuser there. A picture's screen takes its luminance for its own white; a
     cube of radiance has its own light. Raises InputError for anything else.
     """
     try:
-        if name in SCENES:
+        if name in scenes():
             return scene_by_name(name, camera, white, distance_mm=distance_mm, parameters=parameters)
         view = View.of(camera, distance_mm)
     except ValueError as error:
@@ -287,7 +287,7 @@ def scene(
         with _about(file):
             return Cube.choose(own).show(image, view)
     raise InputError(
-        f"scene {name!r} is not known: name one of {', '.join(SCENES)}, a picture ({' '.join(PICTURES)}) or a cube "
+        f"scene {name!r} is not known: name one of {', '.join(scenes())}, a picture ({' '.join(PICTURES)}) or a cube "
         f"({' '.join(CUBES)})"
     )
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Annotated, ClassVar, Self
 
 import cv2
@@ -16,8 +17,10 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from sim.camera import CameraModel, Geometry
+from sim.extensions import refuse
 from sim.parameters import Frozen, Quantity, read_quantities
 from sim.scene import colorchecker
+from sim.scene.chart import Chart, added_charts
 from sim.scene.light import luminance_cd_m2, screen
 from sim.scene.scenes import (
     EdgeRegion,
@@ -162,14 +165,17 @@ class UniformScene(NamedScene):
         return UniformField(white)
 
 
+Gap = Annotated[
+    float, Quantity("1", "share of the patches' distance that the frame between them takes", lower=0.0, upper=0.9)
+]
+
+
 class _Chart(NamedScene):
     chart: ClassVar[str]
     fill: Annotated[
         float, Quantity("1", "the patch grid's size over the largest that fits into the frame", lower=0.05, upper=4.0)
     ] = 0.9
-    gap: Annotated[
-        float, Quantity("1", "share of the patches' distance that the frame between them takes", lower=0.0, upper=0.9)
-    ] = 0.13
+    gap: Gap = 0.13
 
     def place(self, view: View, white: Spectrum) -> Scene:
         rows, cols = (n - self.gap for n in colorchecker.grid(self.chart))
@@ -414,6 +420,28 @@ SCENES: dict[str, type[NamedScene]] = {
 }
 
 
+@cache
+def scenes() -> dict[str, type[NamedScene]]:
+    """Return all named scenes: `SCENES`, and the charts of other packages. A name that is taken stays as it is."""
+    found = dict(SCENES)
+    for name, chart in added_charts().items():
+        if name in SCENES or name in colorchecker.KNOWN:
+            refuse("charts", name, "a scene or a chart of calibench has that name")
+        else:
+            found[name] = _scene_of(name, chart)
+    return found
+
+
+def _scene_of(chart_name: str, added: Chart) -> type[NamedScene]:
+    class AddedChart(_Chart):
+        name: ClassVar[str] = chart_name
+        shows: ClassVar[str] = added.shows
+        chart: ClassVar[str] = chart_name
+        gap: Gap = added.gap
+
+    return AddedChart
+
+
 def scene_by_name(
     name: str,
     camera: CameraModel,
@@ -425,10 +453,10 @@ def scene_by_name(
     """Return the named scene before a camera.
 
     `illuminant`: radiance (W sr^-1 m^-2 nm^-1) of a perfect white diffuser at the scene
-    (`sim.scene.light.illuminant`); full light has it. `parameters`: those of the scene's declaration in `SCENES`;
+    (`sim.scene.light.illuminant`); full light has it. `parameters`: those of the scene's declaration in `scenes()`;
     others keep their defaults. `View.of(camera, distance_mm).magnification` is the magnification that belongs to it.
     Raises ValueError, in one line, for an unknown name or parameter, or a value outside its bounds.
     """
-    if name not in SCENES:
-        raise ValueError(f"scene {name!r} is not known: name one of {', '.join(SCENES)}, or a file")
-    return SCENES[name].choose(parameters).place(View.of(camera, distance_mm), illuminant)
+    if name not in scenes():
+        raise ValueError(f"scene {name!r} is not known: name one of {', '.join(scenes())}, or a file")
+    return scenes()[name].choose(parameters).place(View.of(camera, distance_mm), illuminant)

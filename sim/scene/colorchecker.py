@@ -1,4 +1,4 @@
-"""The ColorCheckers' reflectances, by name of the chart."""
+"""The reflectances of charts, by name: the ColorCheckers', and those of other packages."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from functools import cache
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from sim.scene.chart import added_charts
 from sim.scene.light import colour_science
 from sim.spectrum import FloatArray, Spectrum
 
 #: Rows and columns of the patches.
 GRID = (4, 6)
 GRID_SG = (10, 14)
+KNOWN = {"ColorChecker24": GRID, "ColorCheckerSG": GRID_SG}
 
 #: Patches in the chart's order: rows from dark skin to bluish green down to white to black.
 PATCHES = (
@@ -33,10 +35,10 @@ def grid(chart: str = "ColorChecker24") -> tuple[int, int]:
     >>> grid("ColorChecker24")
     (4, 6)
     """
-    known = {"ColorChecker24": GRID, "ColorCheckerSG": GRID_SG}
+    known = {name: (added.rows, added.cols) for name, added in added_charts().items()} | KNOWN
     if chart not in known:
         raise ValueError(
-            f"chart {chart!r} is not known: there are {' and '.join(known)}, name one of them or leave the capture out"
+            f"chart {chart!r} is not known: there are {', '.join(known)}; name one of them or leave the capture out"
         )
     return known[chart]
 
@@ -54,9 +56,13 @@ def reflectances(chart: str = "ColorChecker24") -> dict[str, Spectrum]:
     measured materials of such a colour (see `recover_reflectances`). They are metamers: on the 24 patches with known
     curves, this recovery has an error of 0.04 rms of reflectance. Don't calibrate a spectral response with them.
 
+    Charts of other packages (`calibench.charts`): as they state them.
+
     Beyond their ends the end values hold. Raises ValueError for a chart that isn't known.
     """
     grid(chart)
+    if chart not in KNOWN:
+        return added_charts()[chart].reflectances
     colour = colour_science()
     if chart == "ColorChecker24":
         return {

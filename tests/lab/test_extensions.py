@@ -53,6 +53,7 @@ import typer
 from lab.formats.importers import Importer
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.observables.observable import measurements
+from sim.scene.chart import Chart
 from sim.spectrum import Spectrum
 
 LAMP = Spectrum.of((400.0, 700.0), (1.0, 2.0))
@@ -66,12 +67,20 @@ def read(path, options):
 
 
 FORMAT = Importer(read)
+GREYS = {f"{i}": Spectrum.of((380.0, 730.0), (i / 7, 0.5)) for i in range(6)}
+CHART = Chart("six patches from grey to colours", 2, 3, GREYS, gap=0.2)
 COMMANDS = typer.Typer()
 
 
 @COMMANDS.command()
 def greet() -> None:
     print("good morning")
+"""
+PERCENT = """
+from sim.scene.chart import Chart
+from sim.spectrum import Spectrum
+
+CHART = Chart("in percent", 1, 1, {"white": Spectrum.of((380.0, 730.0), (90.0, 90.0))})
 """
 POINTS = """[calibench.effects]
 hum_of_ours = extension_of_ours:HumOfOurs
@@ -86,6 +95,12 @@ fits = others_of_ours:FORMAT
 [calibench.illuminants]
 our-lamp = others_of_ours:LAMP
 no-lamp = others_of_ours:read
+[calibench.charts]
+six-patches = others_of_ours:CHART
+six-percent = chart_that_breaks:CHART
+zone-plate = others_of_ours:CHART
+ColorChecker24 = others_of_ours:CHART
+no-chart = others_of_ours:LAMP
 [calibench.observables]
 dark = others_of_ours:LAMP
 [calibench.capture_kinds]
@@ -103,6 +118,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     (folder / "extension_of_ours.py").write_text(EFFECT)
     (folder / "others_of_ours.py").write_text(OTHERS)
     (folder / "extension_that_breaks.py").write_text("1 / 0\n")
+    (folder / "chart_that_breaks.py").write_text(PERCENT)
     (folder / "our_effects-0.1.dist-info").mkdir()
     (folder / "our_effects-0.1.dist-info" / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: our-effects\nVersion: 0.1\n"
@@ -153,6 +169,32 @@ def test_the_contract_runs_on_a_package_by_its_name(
 ) -> None:
     done = run(environment, "-m", "calibench", "check-effect", package)
     assert done.returncode == code and said in done.stdout + done.stderr, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("package", "code", "said"),
+    [
+        ("six-patches", 0, "six-patches: keeps the contract of charts"),
+        ("our-effects", 4, "can't be loaded (ValueError: patch white: reflectance 90 is outside 0..1"),
+        ("zone-plate", 4, "zone-plate: a scene or a chart of calibench has that name; it is left out"),
+        ("none-such", 2, "no installed package of that name adds a chart; installed are ColorChecker24, no-chart, six"),
+    ],
+)  # fmt: skip
+def test_the_contract_of_charts_runs_on_a_package_by_its_name(
+    package: str, code: int, said: str, environment: dict[str, str]
+) -> None:
+    done = run(environment, "-m", "calibench", "check-chart", package)
+    assert done.returncode == code and said in " ".join((done.stdout + done.stderr).split()), done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_chart_is_a_scene_and_broken_ones_are_a_line_each(environment: dict[str, str]) -> None:
+    done = run(environment, "-m", "calibench", "simulate", "list")
+    assert done.returncode == 0 and "six patches from grey to colours" in done.stdout, done.stderr
+    assert "gap=0.2" in done.stdout and done.stdout.count("zone-plate") == 1
+    for name in ("six-percent", "zone-plate", "ColorChecker24", "no-chart"):
+        assert sum(f"calibench.charts: {name}: " in line for line in done.stderr.splitlines()) == 1, done.stderr
     assert "Traceback" not in done.stderr
 
 

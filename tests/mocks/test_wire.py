@@ -36,7 +36,18 @@ GOLDEN = Path(__file__).parent.parent / "wire"
 
 
 def conversations() -> Iterator[tuple[str, int]]:
-    for name in ("cornerstone260", "specbos1211", "pr655", "cr300", "cs2000", "sp2150", "cm110", "pe4000", "stage"):
+    for name in (
+        "cornerstone260",
+        "specbos1211",
+        "pr655",
+        "cr300",
+        "cs2000",
+        "sp2150",
+        "cm110",
+        "pe4000",
+        "spotread",
+        "stage",
+    ):
         for number, _ in enumerate(parse((GOLDEN / f"{name}.txt").read_text(encoding="ascii"))):
             yield name, number
 
@@ -107,6 +118,7 @@ def test_no_input_upsets_a_mock(name: str, talk: Callable[[Grammar, bytes], byte
         "cm110": (b"\x1b" * 5, b"8\x0d", b"\x18"),
         "sp2150": (b"\r", b"SERIAL\r", b"SERIAL 21500427  ok\r\n"),
         "pe4000": (b"\r", b"XMODEL\r", b"XMODEL=pE-4000\r\n"),
+        "spotread": (b"\nspotread -e -c 1\n", b" \n", b"any other key to take a reading: "),
         "stage": (b"\n", b"LIST?\n", b"cap,sphere,colorchecker,screen\r\n"),
     }[name]
     talk(mock, start_over)
