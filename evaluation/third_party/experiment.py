@@ -79,8 +79,8 @@ def draw_set(source: str, number: int) -> tuple[RecordingSet, dict[str, float], 
     """Return set `number` of a source, the truth by the library's parameters, and the check of its simulator."""
     rng = np.random.default_rng([SEED, list(SOURCES).index(source), number])
     camera = draw_camera(rng)
-    if SOURCES[source].pitch_um is not None:
-        camera = replace(camera, pitch_um=SOURCES[source].pitch_um)
+    if (pitch_um := SOURCES[source].pitch_um) is not None:
+        camera = replace(camera, pitch_um=pitch_um)
     model = SOURCES[source].draw(rng, camera)
     record = (
         partial(record_optics, optics=model)

@@ -410,7 +410,7 @@ class Protons(SimulatedSensor):
         per_s = float(rng.uniform(0.6, 2.5))
         area_cm2 = camera.rows * camera.cols * (1e-4 * camera.pitch_um) ** 2
         return cls(
-            {"rate_per_cm2_s": per_s / area_cm2}, "usual", per_s, camera.pitch_um, float(rng.uniform(10.0, 40.0))
+            {"rate_per_cm2_s": per_s / area_cm2}, "usual", per_s, camera.pitch_um, float(rng.uniform(10.0, 20.0))
         )
 
     def _simulation(self, shape: tuple[int, ...]) -> Any:
@@ -450,7 +450,7 @@ class Protons(SimulatedSensor):
     def check(self) -> SimulatorCheck:
         """Connected pixels above 40 e, eight neighbours, of a proton: one track. On pixels of 5 um it falls apart into
         four, as the simulator's steps leave next to nothing in between; on those of 24 um it doesn't. Its charge isn't
-        held: the simulator's tables give some 56 e a um, and 373 follow from a loss of 5.76 MeV cm^2 / g (PSTAR, 100 MeV,
-        2.33 g / cm^3, 3.6 eV an electron). The depth and the points that the library fits take that up."""
+        held: the simulator's tables give some 56 e a um, and 373 follow from a loss of 5.76 MeV cm^2 / g (PSTAR, 100
+        MeV, 2.33 g / cm^3, 3.6 eV an electron). The depth and the points that the library fits take that up."""
         pieces = [label(self._tracks((100, 100), 1, seed)[0] > 40.0, np.ones((3, 3)))[1] for seed in range(1, 61)]
         return SimulatorCheck(1.0, float(np.mean(pieces)), 0.25)
