@@ -199,7 +199,8 @@ def export(
         typer.Option(
             "--to",
             metavar="PATH",
-            help="the recording set (a folder) or the file to write; tiled: a catalogue's folder, or a server's URL",
+            help="the recording set (a folder, or a URL as s3://bucket/set) or the file to write; tiled: a catalogue's "
+            "folder, or a server's URL",
         ),
     ],
     kind: Annotated[
@@ -238,7 +239,7 @@ def export(
     """
     from lab.formats import recording_set
 
-    if kind != TILED:  # a catalogue may be a server's
+    if kind != TILED and not recording_set.is_url(to):  # a catalogue may be a server's
         check_output(Path(to))
     if kind == SPECTRA:
         export_spectra(source, Path(to), quantity, data)
@@ -254,7 +255,10 @@ def export(
     recordings = session_recordings(store_to_read(data), source)
     warn(recordings.warnings)
     with progress_bar("export") as advance:
-        folder = recording_set.write(recordings, Path(to), progress=advance)
+        if recording_set.is_url(to):
+            folder, _ = recording_set.write_url(recordings, to, progress=advance)
+        else:
+            folder = str(recording_set.write(recordings, Path(to), progress=advance))
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 
