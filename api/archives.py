@@ -25,7 +25,7 @@ ARCHIVE: dict[int | str, dict[str, Any]] = {
 }
 
 
-def sent(pieces: Iterator[bytes], name: str, form: ArchiveForm) -> Response:
+def stream_archive(pieces: Iterator[bytes], name: str, form: ArchiveForm) -> Response:
     """Return the pieces of an archive as an answer. The first is made before the answer begins, so that what has no
     files is refused; where a later one is damaged, the answer breaks off."""
     first = next(pieces)

@@ -64,14 +64,14 @@ class DeviceChecks:
     def latest(self, station: str, device: str) -> Checked | None:
         """Return how the latest check of a device went, also before the service's start; None if there was none."""
         if (station, device) not in self._latest:
-            self._latest[station, device] = self._kept(station, device)
+            self._latest[station, device] = self._read_kept(station, device)
         return self._latest[station, device]
 
     def transcript(self, station: str, device: str) -> Path:
         """Return where the transcript of a device's latest check is, if one was kept."""
         return self._folder / station / f"{device}.txt"
 
-    def _kept(self, station: str, device: str) -> Checked | None:
+    def _read_kept(self, station: str, device: str) -> Checked | None:
         try:
             return _CHECKED.validate_json((self._folder / station / f"{device}.json").read_bytes())
         except (OSError, ValidationError):
@@ -91,7 +91,7 @@ class DeviceChecks:
             name=f"check {name} {', '.join(devices)}",
             daemon=True,
         )
-        self._threads = [other for other in self._threads if other.is_alive()] + [thread]
+        self._threads = [running for running in self._threads if running.is_alive()] + [thread]
         thread.start()
 
     def _work(
@@ -103,18 +103,18 @@ class DeviceChecks:
                 self._latest.update(
                     {(name, checked): device_check for checked, device_check in checked_devices.items()}
                 )
-                checked_devices[device] = self._checked(name, station, device, keep_transcript)
+                checked_devices[device] = self._check_device(name, station, device, keep_transcript)
             self._note_safety(station, checked_devices)
         finally:
             let_go()
             # who reads that the last one's check has ended may use the instruments
             self._latest.update(
-                {(name, device): checked_devices.get(device, self._kept(name, device)) for device in devices}
+                {(name, device): checked_devices.get(device, self._read_kept(name, device)) for device in devices}
             )
 
-    def _checked(self, name: str, station: Station, device: str, keep_transcript: bool) -> Checked | None:
+    def _check_device(self, name: str, station: Station, device: str, keep_transcript: bool) -> Checked | None:
         if self._closed:
-            return self._kept(name, device)
+            return self._read_kept(name, device)
         checked = Checked(self._test(name, station, device, keep_transcript), now())
         try:
             write_durably(self._folder / name / f"{device}.json", _CHECKED.dump_json(checked))

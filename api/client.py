@@ -251,7 +251,7 @@ class ServiceClient:
     # --- requests -----------------------------------------------------------------------------------------------------
 
     def request(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Any request below `/api/v1`; a POST has a key, so that it is carried out once."""
+        """Send any request below `/api/v1`; a POST has a key, so that it is carried out once."""
         if method == "POST":
             options["headers"] = {"Idempotency-Key": secrets.token_hex(16)} | dict(options.get("headers") or {})
         response = self.http.request(method, path, **options)
@@ -259,7 +259,7 @@ class ServiceClient:
             raise _problem(response)
         return response
 
-    def _fetched(self, path: str, file: Path) -> Path:
+    def _fetch(self, path: str, file: Path) -> Path:
         """Write the archive of a path to `file`, a .tar where its name ends so, else a .zip, as it arrives: completely,
         or not at all."""
         partial = file.with_name(f".{file.name}.partial")
@@ -320,7 +320,7 @@ class ServiceClient:
                 return
             response = self.request("GET", f"{self.url}{following}")
 
-    def _ended(self, what: str, look: Callable[[], W], ends: tuple[str, ...], patience_s: float) -> W:
+    def _wait_for_end(self, what: str, look: Callable[[], W], ends: tuple[str, ...], patience_s: float) -> W:
         """Return what `look` finds once its state is one of `ends`. Raises ServiceProblem unless that is the first of
         them, the good one."""
         until = time.monotonic() + patience_s
@@ -346,7 +346,7 @@ class ServiceClient:
         return _read(Health, response.content)
 
     def metrics(self) -> str:
-        """Requests, sessions and jobs, as Prometheus reads them."""
+        """Return requests, sessions and jobs, as Prometheus reads them."""
         return self.request("GET", f"{self.url}/metrics").text
 
     def me(self) -> Me:
@@ -360,7 +360,7 @@ class ServiceClient:
         return list(self._pages(StationState, "/stations"))
 
     def station(self, name: str) -> StationState:
-        """One station."""
+        """Return a station."""
         return self._get(StationState, f"/stations/{name}")
 
     def connected(self) -> list[ConnectedDevice]:
@@ -372,7 +372,7 @@ class ServiceClient:
         return list(self._pages(DeviceState, f"/stations/{station}/devices"))
 
     def device(self, station: str, device: str) -> DeviceState:
-        """One instrument of a station."""
+        """Return an instrument of a station."""
         return self._get(DeviceState, f"/stations/{station}/devices/{device}")
 
     def start_check(self, station: str, device: str, *, transcript: bool = False) -> DeviceState:
@@ -413,7 +413,7 @@ class ServiceClient:
         return list(self._pages(SequenceDescription, "/sequences"))
 
     def sequence(self, name: str) -> SequenceDescription:
-        """One sequence of the catalogue."""
+        """Return a sequence of the catalogue."""
         return self._get(SequenceDescription, f"/sequences/{name}")
 
     def estimate(self, station: str, asked: PlanAsked | None = None) -> PlanEstimate:
@@ -421,11 +421,11 @@ class ServiceClient:
         return self._post(PlanEstimate, f"/stations/{station}/estimate", asked or PlanAsked())
 
     def sessions(self, **only: str) -> Iterator[ListedSession]:
-        """Sessions, the newest first; `only`: those that a `search` finds, or of a `verdict`."""
+        """Yield sessions, the newest first; `only`: those that a `search` finds, or of a `verdict`."""
         return self._pages(ListedSession, "/sessions", **only)
 
     def session(self, session_id: str) -> SessionDetail:
-        """One session, with its provenance."""
+        """Return a session, with its provenance."""
         return self._get(SessionDetail, f"/sessions/{session_id}")
 
     def start_session(self, start: SessionStart) -> StoredSession:
@@ -485,7 +485,7 @@ class ServiceClient:
     def wait_session(self, session_id: str, patience_s: float = PATIENCE_S) -> SessionDetail:
         """Wait until a session's run is over. Raises ServiceProblem unless it finished."""
         ends = ("finished", "interrupted", "failed")
-        return self._ended(f"session {session_id}", lambda: self.session(session_id), ends, patience_s)
+        return self._wait_for_end(f"session {session_id}", lambda: self.session(session_id), ends, patience_s)
 
     def capture(
         self,
@@ -522,7 +522,7 @@ class ServiceClient:
             yield _read(Progress, data) if name == "progress" else _read(StoredSession, data)
 
     def stored_capture(self, session_id: str, capture_id: int) -> StoredCapture:
-        """One capture."""
+        """Return a capture."""
         return self._get(StoredCapture, f"/sessions/{session_id}/captures/{capture_id}")
 
     def preview(
@@ -541,11 +541,11 @@ class ServiceClient:
         ).content
 
     def capture_figures(self, session_id: str, capture_id: int) -> FrameFigures:
-        """Histogram, mean and saturated share of each channel of a frame."""
+        """Return histogram, mean and saturated share of each channel of a frame."""
         return self._get(FrameFigures, f"/sessions/{session_id}/captures/{capture_id}/figures")
 
     def curves(self, session_id: str) -> Curves:
-        """Photon transfer, sensitivity and MTF as a session's captures so far show them."""
+        """Return photon transfer, sensitivity and MTF as a session's captures so far show them."""
         return self._get(Curves, f"/sessions/{session_id}/curves")
 
     def frame(self, capture: StoredCapture) -> NDArray[np.uint16]:
@@ -586,11 +586,11 @@ class ServiceClient:
             )
 
     def recordings(self) -> Iterator[Recordings]:
-        """All recording sets that were sent in, the newest first."""
+        """Yield all recording sets that were sent in, the newest first."""
         return self._pages(Recordings, "/recordings")
 
     def recording_set(self, recordings_id: str) -> RecordingsDetail:
-        """One recording set that was sent in."""
+        """Return a recording set that was sent in."""
         return self._get(RecordingsDetail, f"/recordings/{recordings_id}")
 
     def recorded_captures(self, recordings_id: str, **only: str) -> Iterator[RecordedCapture]:
@@ -598,7 +598,7 @@ class ServiceClient:
         return self._pages(RecordedCapture, f"/recordings/{recordings_id}/captures", **only)
 
     def recorded_capture(self, recordings_id: str, number: int) -> RecordedCapture:
-        """One capture of a recording set, by its number from 1."""
+        """Return a capture of a recording set, by its number from 1."""
         return self._get(RecordedCapture, f"/recordings/{recordings_id}/captures/{number}")
 
     def recorded_preview(self, recordings_id: str, number: int, *, picture: Literal["png", "webp"] = "png") -> bytes:
@@ -612,7 +612,7 @@ class ServiceClient:
         return frame
 
     def recorded_capture_figures(self, recordings_id: str, number: int) -> FrameFigures:
-        """Histogram, mean and saturated share of each channel of a recording set's frame."""
+        """Return histogram, mean and saturated share of each channel of a recording set's frame."""
         return self._get(FrameFigures, f"/recordings/{recordings_id}/captures/{number}/figures")
 
     def recordings_figures(self, recordings_id: str) -> list[FigureOfFit]:
@@ -621,7 +621,7 @@ class ServiceClient:
 
     def fetch_recordings(self, recordings_id: str, file: Path) -> Path:
         """Write a recording set that was sent in to `file`, a .zip or .tar."""
-        return self._fetched(f"/recordings/{recordings_id}/archive", file)
+        return self._fetch(f"/recordings/{recordings_id}/archive", file)
 
     def delete_recordings(self, recordings_id: str) -> None:
         """Delete a recording set for ever."""
@@ -629,7 +629,7 @@ class ServiceClient:
 
     def fetch_session(self, session_id: str, file: Path) -> Path:
         """Write a session to `file`, a .zip or .tar of a recording set."""
-        return self._fetched(f"/sessions/{session_id}/archive", file)
+        return self._fetch(f"/sessions/{session_id}/archive", file)
 
     def delete_session(self, session_id: str) -> None:
         """Delete a session for ever; its results and calibrations stay."""
@@ -660,11 +660,11 @@ class ServiceClient:
         return self._post(Job, "/pipelines", start)
 
     def job(self, job_id: str) -> Job:
-        """One job."""
+        """Return a job."""
         return self._get(Job, f"/jobs/{job_id}")
 
     def jobs(self, **only: str) -> Iterator[Job]:
-        """All jobs, the newest first."""
+        """Yield all jobs, the newest first."""
         return self._pages(Job, "/jobs")
 
     def cancel(self, job_id: str) -> Job:
@@ -673,9 +673,11 @@ class ServiceClient:
 
     def wait_job(self, job_id: str, patience_s: float = PATIENCE_S) -> Job:
         """Wait until a job is over. Raises ServiceProblem unless it is done."""
-        return self._ended(f"job {job_id}", lambda: self.job(job_id), ("done", "failed", "cancelled"), patience_s)
+        return self._wait_for_end(
+            f"job {job_id}", lambda: self.job(job_id), ("done", "failed", "cancelled"), patience_s
+        )
 
-    def _made(
+    def _make(
         self, model: type[M], kind: JobKind, source: Source, patience_s: float, engine: Engine = DEFAULT_ENGINE
     ) -> M:
         start = self.start_recordings_job if isinstance(source, Recordings) else self.start_job
@@ -684,18 +686,18 @@ class ServiceClient:
 
     def fit(self, source: Source, patience_s: float = PATIENCE_S) -> FitResult:
         """Fit a finished session, or recordings that were sent in, and wait for the result."""
-        return self._made(FitResult, "fit", source, patience_s)
+        return self._make(FitResult, "fit", source, patience_s)
 
     def validate(self, source: Source, patience_s: float = PATIENCE_S) -> ValidationResult:
         """Validate the fit of a finished session, or of recordings, and wait for the result."""
-        return self._made(ValidationResult, "validate", source, patience_s)
+        return self._make(ValidationResult, "validate", source, patience_s)
 
     def diagnose(
         self, source: Source, patience_s: float = PATIENCE_S, *, engine: Engine = DEFAULT_ENGINE
     ) -> DiagnosisResult:
         """Diagnose a finished session, or recordings that were sent in, and wait for the result. `engine`: `evidence`
         or `today`."""
-        return self._made(DiagnosisResult, "diagnose", source, patience_s, engine)
+        return self._make(DiagnosisResult, "diagnose", source, patience_s, engine)
 
     def findings(self, session_id: str) -> DiagnosisFindings:
         """Return what a session's newest diagnosis found, in words."""
@@ -716,19 +718,19 @@ class ServiceClient:
     # --- calibrations -------------------------------------------------------------------------------------------------
 
     def calibrations(self) -> Iterator[CalibrationRecord]:
-        """All calibrations, the newest first."""
+        """Yield all calibrations, the newest first."""
         return self._pages(CalibrationRecord, "/calibrations")
 
     def calibration(self, calibration_id: str) -> CalibrationDetail:
-        """One calibration, with its judgements, and what speaks against it."""
+        """Return a calibration, with its judgements, and what speaks against it."""
         return self._get(CalibrationDetail, f"/calibrations/{calibration_id}")
 
     def calibration_figures(self, calibration_id: str) -> list[FigureOfFit]:
-        """Every figure of a calibration."""
+        """Return every figure of a calibration."""
         return list(self._pages(FigureOfFit, f"/calibrations/{calibration_id}/figures"))
 
     def drafted_limits(self, calibration_id: str) -> DraftedLimits:
-        """Limits drafted from what the same cameras had before."""
+        """Return limits drafted from what the same cameras had before."""
         return self._get(DraftedLimits, f"/calibrations/{calibration_id}/drafted-limits")
 
     def certificate(self, calibration_id: str) -> Certificate:
@@ -759,7 +761,7 @@ class ServiceClient:
         return self._pages(CameraModels, "/camera-models")
 
     def camera_model(self, model_id: str) -> CameraModels:
-        """One camera model, with the parameters of each camera."""
+        """Return a camera model, with the parameters of each camera."""
         return self._get(CameraModels, f"/camera-models/{model_id}")
 
     def send_camera_model(self, archive: Path, *, lensfun: str = "", lens: str = "") -> CameraModels:
@@ -774,7 +776,7 @@ class ServiceClient:
 
     def fetch_camera_model(self, model_id: str, file: Path) -> Path:
         """Write the camera files of a model to `file`, a .zip or .tar."""
-        return self._fetched(f"/camera-models/{model_id}/archive", file)
+        return self._fetch(f"/camera-models/{model_id}/archive", file)
 
     def predict(self, asked: PredictionStart) -> StoredPrediction:
         """Predict a session that hasn't been captured, and seal that."""
@@ -785,7 +787,7 @@ class ServiceClient:
         return self._pages(StoredPrediction, "/predictions")
 
     def prediction(self, prediction_id: str) -> StoredPrediction:
-        """One prediction."""
+        """Return a prediction."""
         return self._get(StoredPrediction, f"/predictions/{prediction_id}")
 
     def sealed_prediction(self, prediction_id: str) -> bytes:
@@ -808,7 +810,7 @@ class ServiceClient:
         return {side: BudgetResult.model_validate(budget) for side, budget in budgets.items()}
 
     def compare(self, a: str, b: str, fail_on: Sequence[str] = ()) -> Comparison:
-        """Two calibrations, by id, compared as `calibench compare` does."""
+        """Compare two calibrations, by id, as `calibench compare` does."""
         return self._get(Comparison, "/comparisons", a=a, b=b, fail_on=list(fail_on))
 
     def comparison_page(self, a: str, b: str) -> str:
@@ -824,7 +826,7 @@ class ServiceClient:
         return self._get(History, "/history", camera=camera, figure=figure, place=place)
 
     def drift(self, camera: str, *, reference_c: float | None = None, newest: int = BOARD_COLUMNS) -> DriftBoard:
-        """All figures of a camera by its newest calibrations, dark currents at a reference temperature."""
+        """Return all figures of a camera by its newest calibrations, dark currents at a reference temperature."""
         asked: dict[str, Any] = {"camera": camera, "newest": newest}
         return self._get(DriftBoard, "/drift", **asked | ({} if reference_c is None else {"reference_c": reference_c}))
 
@@ -839,5 +841,5 @@ class ServiceClient:
         return list(self._pages(EffectDescription, "/effects"))
 
     def effect(self, name: str) -> EffectDescription:
-        """One effect."""
+        """Return an effect."""
         return self._get(EffectDescription, f"/effects/{name}")

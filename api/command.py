@@ -40,7 +40,7 @@ def _first_key(store: Store) -> None:
 
 
 def logging_config() -> dict[str, Any]:
-    """uvicorn's logging configuration, with a filter that removes keys from URLs."""
+    """Return uvicorn's logging configuration, with a filter that removes keys from URLs."""
     from uvicorn.config import LOGGING_CONFIG
 
     config = copy.deepcopy(LOGGING_CONFIG)
@@ -99,7 +99,7 @@ def serve(
             raise InputError(f"{file}: can't be read; give a PEM file")
     from lab.capture.recovery import Recovery
     from lab.capture.room import Room
-    from lab.capture.safe_at_start import made_safe_at_start
+    from lab.capture.safe_at_start import wait_until_safe_at_start
     from lab.capture.settings import Settings
     from lab.capture.tables import use_alone
 
@@ -123,7 +123,7 @@ def serve(
         check_bind(host, stored_keys(store))
     with (
         _listening(host, port) as line,
-        contextlib.closing(Recovery(store, made_safe=made_safe_at_start())) as recovery,
+        contextlib.closing(Recovery(store, made_safe=wait_until_safe_at_start())) as recovery,
     ):
         # Before the service itself is loaded, which takes seconds: an instrument that wasn't reached at once may be
         # unsafe.
@@ -173,7 +173,7 @@ def create(
 
 @key.command("list")
 def list_keys(data: Folder = None) -> None:
-    """Names and scopes of all keys.
+    """List names and scopes of all keys.
 
     Example: calibench key list
     """

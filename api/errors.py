@@ -51,7 +51,15 @@ MEDIA_TYPE = "application/problem+json"
 
 
 def problem(status: int, detail: str, headers: Mapping[str, str] | None = None) -> Response:
-    """Return an error response."""
+    """Return an error response: problem details (RFC 9457).
+
+    status : of HTTP
+    detail : one line: quantity, value, limit, remedy
+    headers : further ones
+
+    >>> problem(404, "no session 7").status_code
+    404
+    """
     body = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail)
     return Response(body.model_dump_json(), status, headers, MEDIA_TYPE)
 
@@ -74,13 +82,17 @@ _MEANINGS = {
 
 
 def answers(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's error responses of a route. They are problem details whatever the route returns, so FastAPI's `model`
-    doesn't fit."""
+    """Return OpenAPI's error responses of a route. They are problem details whatever the route returns, so that
+    FastAPI's `model` doesn't fit.
+
+    >>> list(answers(404, 422))
+    [404, 422]
+    """
     content = {MEDIA_TYPE: {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}}
     return {status: {"description": _MEANINGS[status], "content": content} for status in statuses}
 
 
-def known(what: str, look: Callable[[], T]) -> T:
+def find_or_404(what: str, look: Callable[[], T]) -> T:
     """Return the result of `look`. Raises 404 with `what` as its one line where `look` raises InputError."""
     try:
         return look()
@@ -155,15 +167,17 @@ def _of_field(expected: Expected, problem: Mapping[str, Any]) -> str:
 def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     lines: list[str] = []
-    for one in error.errors():
-        if one["loc"][0] == "path" and one["type"] != "literal_error":
-            return _unknown_in_path(request, str(one["loc"][1]))
-        if one["type"] == "json_invalid":
-            lines.append(f"the body isn't JSON: {one['ctx']['error']}, at character {one['loc'][-1]}")
+    for detail in error.errors():
+        if detail["loc"][0] == "path" and detail["type"] != "literal_error":
+            return _unknown_in_path(request, str(detail["loc"][1]))
+        if detail["type"] == "json_invalid":
+            lines.append(f"the body isn't JSON: {detail['ctx']['error']}, at character {detail['loc'][-1]}")
             continue
-        where = ".".join(str(part) for part in one["loc"] if part != "body")
-        line = _not_as_expected(request, where, one)
-        if not any(other.startswith(f"{where}.") for other in lines):  # it follows from the line on a part of it
+        where = ".".join(str(part) for part in detail["loc"] if part != "body")
+        line = _not_as_expected(request, where, detail)
+        if not any(
+            known_line.startswith(f"{where}.") for known_line in lines
+        ):  # it follows from the line on a part of it
             lines.append(line)
     return problem(422, request.app.state.public("; ".join(lines)))
 

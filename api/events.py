@@ -15,7 +15,7 @@ KEEP_ALIVE_S = 15.0
 
 
 def event(name: str, content: BaseModel) -> ServerSentEvent:
-    """One event with a schema as its data."""
+    """Return an event with a schema as its data."""
     return ServerSentEvent(event=name, data=content.model_dump_json())
 
 
@@ -28,7 +28,7 @@ def stream(events: Callable[[anyio.Event], AsyncIterator[ServerSentEvent]]) -> E
     )
 
 
-async def watched(
+async def watch_state(
     look: Callable[[], BaseModel],
     over: Callable[[Any], bool],
     name: str,
@@ -56,8 +56,8 @@ async def watched(
             return
 
 
-def described(*events: tuple[str, type[BaseModel], str]) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's description of a stream: each event's name, its data, and when it is sent."""
+def describe_events(*events: tuple[str, type[BaseModel], str]) -> dict[int | str, dict[str, Any]]:
+    """Return OpenAPI's description of a stream: each event's name, its data, and when it is sent."""
     lines = [f"- `{name}`: {when}; its data is a `{model.__name__}`." for name, model, when in events]
     schema = {
         "type": "string",

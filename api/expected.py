@@ -38,7 +38,7 @@ class Expected:
     def body(self) -> dict[str, Any] | None:
         """The schema of its JSON body; None where it takes none."""
         content = self._operation.get("requestBody", {}).get("content", {})
-        return self._resolved(content["application/json"]["schema"]) if "application/json" in content else None
+        return self._resolve(content["application/json"]["schema"]) if "application/json" in content else None
 
     def example(self) -> str:
         """Return an example of the body, as JSON."""
@@ -67,7 +67,7 @@ class Expected:
         if place[0] == "query":
             for parameter in self._operation.get("parameters", ()):
                 if parameter["in"] == "query" and parameter["name"] == place[-1]:
-                    return self._resolved(parameter["schema"])
+                    return self._resolve(parameter["schema"])
             return None
         schema = self.body
         for part in place[1:]:
@@ -75,16 +75,16 @@ class Expected:
                 return None
             inner = schema.get("items") if isinstance(part, int) else schema.get("properties", {}).get(part)
             inner = inner or schema.get("additionalProperties")
-            schema = self._resolved(inner) if isinstance(inner, dict) else None
+            schema = self._resolve(inner) if isinstance(inner, dict) else None
         return schema
 
-    def _resolved(self, schema: dict[str, Any]) -> dict[str, Any]:
+    def _resolve(self, schema: dict[str, Any]) -> dict[str, Any]:
         """Return a schema with its reference followed, and the first that isn't null of several."""
         if "$ref" in schema:
-            return self._resolved(self._schemas[schema["$ref"].rpartition("/")[2]])
+            return self._resolve(self._schemas[schema["$ref"].rpartition("/")[2]])
         for alternative in schema.get("anyOf", schema.get("oneOf", ())):
             if alternative.get("type") != "null":
-                return self._resolved(alternative)
+                return self._resolve(alternative)
         return schema
 
     def _example_at(self, place: Sequence[int | str], schema: dict[str, Any]) -> Any:
@@ -98,9 +98,9 @@ class Expected:
             return schema["example"] if "example" in schema else schema["enum"][0]
         if schema.get("type") == "object" and schema.get("properties"):
             needed = schema.get("required") or list(schema["properties"])[:1]
-            return {name: self._example_of(self._resolved(schema["properties"][name])) for name in needed}
+            return {name: self._example_of(self._resolve(schema["properties"][name])) for name in needed}
         if schema.get("type") == "array" and isinstance(schema.get("items"), dict):
-            return [self._example_of(self._resolved(schema["items"]))] * schema.get("minItems", 1)
+            return [self._example_of(self._resolve(schema["items"]))] * schema.get("minItems", 1)
         if schema.get("format") == "date-time":
             return "2030-01-01T12:00:00Z"
         return _EXAMPLES.get(schema.get("type", ""), "text")

@@ -22,7 +22,11 @@ ADDRESSES = 10_000
 
 def network_of(address: str) -> str:
     """Return what is counted as one address: an IPv4 address, or the 64 bits of an IPv6 network, of which a client has
-    all addresses."""
+    all addresses.
+
+    >>> network_of("192.0.2.1"), network_of("2001:db8::1")
+    ('192.0.2.1', '2001:db8::/64')
+    """
     try:
         parsed = ipaddress.ip_address(address)
     except ValueError:
@@ -48,12 +52,12 @@ class FailedKeys:
         return min(self.most, left + (self.clock() - at) * self.per_s)
 
     def wait_s(self, address: str) -> int:
-        """Whole seconds until a key from this address is compared again; 0: now."""
+        """Return the whole seconds until a key from this address is compared again; 0: now."""
         with self._lock:
             left = self._now(network_of(address))
         return 0 if left >= 1.0 else math.ceil((1.0 - left) / self.per_s)
 
-    def failed(self, address: str) -> None:
+    def count_failure(self, address: str) -> None:
         """Count a key that wasn't valid."""
         network = network_of(address)
         with self._lock:

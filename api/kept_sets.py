@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from fastapi import Response
 
-from api.archives import sent
+from api.archives import stream_archive
 from api.errors import Conflict
 from api.service import OVER, Service
 from lab.calibration.life import check_nothing_rests_on
@@ -33,7 +33,7 @@ class KeptSet:
         except InputError as error:
             raise Conflict(str(error)) from None
         recordings.cache_bytes = 0  # each frame is read once
-        return sent(archive(recordings, form), self.what.replace(" ", "-"), form)
+        return stream_archive(archive(recordings, form), self.what.replace(" ", "-"), form)
 
     def delete(self, service: Service) -> None:
         """Delete it for ever. Raises Conflict while a job works on it, or where it can't be deleted now."""
@@ -63,8 +63,8 @@ def session_set(service: Service, session_id: str) -> KeptSet:
     return KeptSet(f"session {session_id}", session_id, read, remove)
 
 
-def sent_set(service: Service, recordings_id: str) -> KeptSet:
-    """Recordings that were sent in; 404 where there are none of that id."""
+def find_sent_set(service: Service, recordings_id: str) -> KeptSet:
+    """Return recordings that were sent in; 404 where there are none of that id."""
     folder = service.recordings(recordings_id)
     inbox = service.inbox
     return KeptSet(

@@ -47,12 +47,20 @@ class Permission(StrEnum):
 
 
 def new_key() -> str:
-    """Return a fresh key: 256 random bits behind a prefix that secret scanners can find."""
+    """Return a fresh key: 256 random bits behind a prefix that secret scanners can find.
+
+    >>> new_key().startswith(KEY_PREFIX), new_key() == new_key()
+    (True, False)
+    """
     return KEY_PREFIX + secrets.token_urlsafe(32)
 
 
 def digest(key: str) -> str:
-    """Return what is stored of a key."""
+    """Return what is stored of a key: its SHA-256.
+
+    >>> len(digest("a key"))
+    64
+    """
     return hashlib.sha256(key.encode()).hexdigest()
 
 
@@ -151,7 +159,11 @@ class HideKeys(logging.Filter):
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address is this computer's own."""
+    """Return whether an address is this computer's own.
+
+    >>> is_loopback("127.0.0.1"), is_loopback("192.0.2.1")
+    (True, False)
+    """
     if host == "localhost":
         return True
     try:

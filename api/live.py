@@ -409,7 +409,7 @@ class LiveSessions:
             raise Conflict("one of these instruments is being checked or made safe; wait for the end of that")
 
     def busy(self, station: Station) -> str | None:
-        """Id of a session that uses an instrument of this station now, in this process or another."""
+        """Return the id of a session that uses an instrument of this station now, in this process or another."""
         wanted = station.addresses
         for id, session in self._live.items():
             if not session.ended and wanted & session.station.addresses:

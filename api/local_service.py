@@ -22,7 +22,7 @@ _ADDRESS = re.compile(r"operator's page: (http://\S+)/")
 
 @contextlib.contextmanager
 def service_process(data: Path) -> Iterator[str]:
-    """`calibench serve` on a data folder, in a process of its own; its address."""
+    """Run `calibench serve` on a data folder within the block, in a process of its own; yield its address."""
     command = [sys.executable, "-m", "calibench", "serve", "--data", str(data), "--port", "0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None

@@ -47,13 +47,13 @@ class Metrics:
             registry=self._registry,
         )
 
-    def answered(self, method: str, route: str, status: int, seconds: float) -> None:
+    def count_response(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count a response."""
         self._requests.labels(method, route, str(status)).inc()
         self._first_byte.labels(method, route).observe(seconds)
 
     def text(self) -> bytes:
-        """All metrics, as Prometheus reads them."""
+        """Return all metrics, as Prometheus reads them."""
         return generate_latest(self._registry)
 
 
@@ -75,7 +75,7 @@ class CountedRequests:
                 # A request that no route takes has no path of its own; a method that nobody uses is no label, either.
                 route = getattr(scope.get("route"), "path", "none")
                 method = scope["method"] if route != "none" else "any"
-                self.metrics.answered(method, route, message["status"], time.perf_counter() - began_s)
+                self.metrics.count_response(method, route, message["status"], time.perf_counter() - began_s)
             await send(message)
 
         await self.app(scope, receive, noted)

@@ -44,7 +44,18 @@ def page_headers(request: Request, response: Response, total: int, limit: int, i
 
 
 def page_of(ids: list[str], after: str | None, limit: int, what: str) -> list[str]:
-    """Of a list that is all there: the ids of the page after a cursor. Raises 422 for a cursor that isn't in it."""
+    """Return the ids of the page after a cursor, of a list that is all there.
+
+    ids : the list
+    after : id of the last one before the page; None: from the beginning
+    limit : how many
+    what : what they are, for the message
+
+    Raises 422 for a cursor that isn't in the list.
+
+    >>> page_of(["a", "b", "c"], "a", 1, "session")
+    ['b']
+    """
     if after is not None and after not in ids:
         raise HTTPException(422, f"after: no {what} {after!r}; begin without it")
     begin = ids.index(after) + 1 if after is not None else 0

@@ -25,12 +25,14 @@ class Pictures:
         self._store, self._inbox = store, inbox
         self._sent = functools.lru_cache(SETS)(self._read)
         self._making = threading.Lock()
-        self._frame = functools.lru_cache(FRAMES)(self._loaded)
-        self._picture = functools.lru_cache(PICTURES)(self._made_picture)
-        self._figures = functools.lru_cache(FIGURES)(self._made_figures)
+        self._frame = functools.lru_cache(FRAMES)(self._load)
+        self._picture = functools.lru_cache(PICTURES)(self._make_picture)
+        self._figures = functools.lru_cache(FIGURES)(self._make_figures)
 
     def recordings(self, recordings_id: str) -> RecordingSet:
-        """Recordings that were sent in, read once for all who look at them. Raises InputError where there are none."""
+        """Return recordings that were sent in, read once for all who look at them. Raises InputError where there are
+        none.
+        """
         self._inbox.folder(recordings_id)
         return self._sent(recordings_id)
 
@@ -54,7 +56,7 @@ class Pictures:
         with self._making:
             return self._figures(source, capture_id)
 
-    def _loaded(self, source: str, capture_id: int) -> tuple[NDArray[np.uint16], DataSheet]:
+    def _load(self, source: str, capture_id: int) -> tuple[NDArray[np.uint16], DataSheet]:
         if is_recordings(source):
             recordings = self.recordings(source)
             capture = recordings.captures()[capture_id - 1]
@@ -63,9 +65,9 @@ class Pictures:
             (capture,) = recordings.captures()
         return recordings.frame(capture), recordings.camera(capture.side)
 
-    def _made_picture(self, source: str, capture_id: int, width_px: int, stretch: bool, form: Form) -> bytes:
+    def _make_picture(self, source: str, capture_id: int, width_px: int, stretch: bool, form: Form) -> bytes:
         frame, camera = self._frame(source, capture_id)
         return preview(frame, camera, width_px, stretch, form)
 
-    def _made_figures(self, source: str, capture_id: int) -> FrameFigures:
+    def _make_figures(self, source: str, capture_id: int) -> FrameFigures:
         return frame_figures(*self._frame(source, capture_id))

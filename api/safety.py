@@ -33,7 +33,7 @@ class StationSafety(Frozen):
 
     @classmethod
     def of(cls, state: SafeState) -> StationSafety:
-        """From what the instruments answered."""
+        """Return the state of a station from what its instruments answered."""
         if state.complaints:
             return cls(state="not confirmed", shutter=state.shutter, at=state.at, words="; ".join(state.complaints))
         return cls(state="safe", shutter=state.shutter, at=state.at)

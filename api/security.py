@@ -90,7 +90,7 @@ class Gate:
         holder_of_key = holder(key, self.keys(False)) or holder(key, self.keys(True))
         if holder_of_key is None:
             self._proven.discard(mine)
-            self.failures.failed(address)
+            self.failures.count_failure(address)
         else:
             self._proven.add(mine)
         return holder_of_key
@@ -238,11 +238,11 @@ class SameHost:
             except ValueError:
                 origin_host = ""
             if origin_host != named[0].lower():
-                own = f"http(s)://{named[0]}"
+                expected = f"http(s)://{named[0]}"
                 return problem(
                     403,
-                    f"Origin: {origin[:80]!r} isn't this service's, which is {own!r} here; open the page under that "
-                    "address, or send no Origin",
+                    f"Origin: {origin[:80]!r} isn't this service's, which is {expected!r} here; open the page under "
+                    "that address, or send no Origin",
                 )
         return None
 

@@ -36,15 +36,16 @@ class Arrived:
     place: Path
     archive: Path
 
-    def told(self, text: str) -> str:
+    def name_as_sent(self, text: str) -> str:
         """Return a sentence about its files, which names them as in the archive."""
         return self.service.public(as_in_archive(text, self.place))
 
 
 @contextlib.asynccontextmanager
-async def arrived(service: Service, request: Request, most_bytes: int) -> AsyncIterator[Arrived]:
-    """The archive of a request's body, `most_bytes` at most, while it is used. Raises 422 for another kind of body, and
-    413 or 507 where the body, or what is done with it, goes beyond a cap or the disk."""
+async def receive_archive(service: Service, request: Request, most_bytes: int) -> AsyncIterator[Arrived]:
+    """Receive the archive of a request's body, `most_bytes` at most, while it is used. Raises 422 for another kind of
+    body, and 413 or 507 where the body, or what is done with it, goes beyond a cap or the disk.
+    """
     sent = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if sent not in TYPES:
         raise HTTPException(422, f"Content-Type {sent[:60]!r}: send the archive itself, as {', '.join(ARCHIVES)}")

@@ -13,7 +13,7 @@ from fastapi import Depends, HTTPException, Request
 from fastapi import Path as PathParameter
 
 from api.checks import DeviceChecks
-from api.errors import Conflict, known
+from api.errors import Conflict, find_or_404
 from api.keys import Permission
 from api.live import LiveSessions
 from api.pictures import Pictures
@@ -99,7 +99,7 @@ class Service:
 
     def session(self, session_id: str) -> SessionInfo:
         """Return a session; 404 where there is none."""
-        return known(missing_session(session_id), lambda: self.store.session(session_id))
+        return find_or_404(missing_session(session_id), lambda: self.store.session(session_id))
 
     def state(self, info: SessionInfo) -> Any:
         """Return what state a session is in: as this service runs it, else as the registry has it."""
@@ -112,7 +112,7 @@ class Service:
 
     def job(self, job_id: str) -> JobInfo:
         """Return a job; 404 where there is none."""
-        return known(f"no job {job_id[:60]!r}; GET /api/v1/jobs lists them", lambda: self.jobs.job(job_id))
+        return find_or_404(f"no job {job_id[:60]!r}; GET /api/v1/jobs lists them", lambda: self.jobs.job(job_id))
 
     def check_no_job(self, source: str, what: str) -> None:
         """Raises Conflict where a job on this source is queued or runs."""
@@ -121,7 +121,7 @@ class Service:
 
     def recordings(self, recordings_id: str) -> Path:
         """Return the folder of recordings that were sent in; 404 where there are none of that id."""
-        return known(
+        return find_or_404(
             f"no recordings {recordings_id[:60]!r}; GET /api/v1/recordings lists them",
             lambda: self.inbox.folder(recordings_id),
         )
@@ -137,9 +137,9 @@ class Service:
     def progress(self, session_id: str) -> Progress | None:
         """Return the latest progress of a session that this process runs, else None."""
         live = self.live.find(session_id)
-        return self.told(live.latest) if live is not None and live.latest is not None else None
+        return self.make_public(live.latest) if live is not None and live.latest is not None else None
 
-    def told(self, progress: Progress) -> Progress:
+    def make_public(self, progress: Progress) -> Progress:
         """Return a session's progress as an answer may have it."""
         texts = {
             "what": self.public(progress.what),
@@ -174,14 +174,18 @@ class Service:
 
 
 def missing_session(session_id: str) -> str:
-    """Return what is said of a session that isn't there."""
+    """Return what is said of a session that isn't there.
+
+    >>> missing_session("20300101")
+    "no session '20300101'; GET /api/v1/sessions lists them"
+    """
     return f"no session {session_id[:60]!r}; GET /api/v1/sessions lists them"
 
 
 def camera_model(service: Service, model_id: str) -> CameraModelRecord:
     """Return a camera model; 404 where there is none."""
     missing = f"no camera model {model_id!r}; GET /api/v1/camera-models lists them"
-    return known(missing, lambda: camera_models.record(service.store, model_id))
+    return find_or_404(missing, lambda: camera_models.record(service.store, model_id))
 
 
 @functools.lru_cache(maxsize=64)

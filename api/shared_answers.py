@@ -46,7 +46,9 @@ class Shared:
         self._answers: dict[str, _Answer] = {}
 
     def forget(self) -> None:
-        """Something changed: the next request of each kind is answered anew. May be called by any thread."""
+        """Forget what is kept, as something changed: the next request of each kind is answered anew. May be called by
+        any thread.
+        """
         self._answers = {}
 
     def find(self, asked: str) -> _Answer | None:

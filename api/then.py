@@ -45,7 +45,7 @@ def keep_request(store: Store, session_id: str, asked: SessionStart) -> None:
         row.then_state = None if asked.then is None else "waiting"
 
 
-def kept_request(store: Store, session_id: str) -> SessionStart | None:
+def read_request(store: Store, session_id: str) -> SessionStart | None:
     """Return what a session was asked to start with, with the name, the notes and the time that it has now; None where
     it wasn't started by a service."""
     with store.reading() as db:
@@ -204,10 +204,10 @@ class ThenRunner:
                 follows, "failed", follows.then, f"job {job.id} is {job.state}: {job.error or 'without a reason'}"
             )
             return
-        words, comparison = self._compared(follows) if follows.asked.compare else ("", None)
+        words, comparison = self._compare_with_certified(follows) if follows.asked.compare else ("", None)
         self._end(follows, "done", follows.then | ({"comparison": comparison} if comparison else {}), words)
 
-    def _compared(self, follows: _Following) -> tuple[str, str | None]:
+    def _compare_with_certified(self, follows: _Following) -> tuple[str, str | None]:
         """Return how the newest fit of a session compares with the certified calibration of its cameras."""
         newest = calibration(self._store, follows.id)
         of_rig = (CalibrationRow.rig == rig_of(newest.cameras), CalibrationRow.certified.is_not(None))
@@ -226,14 +226,14 @@ class ThenRunner:
 
     def _tell_early_end(self, follows: _Following) -> None:
         if follows.then.get("told_of") != follows.state:
-            failure = self._told(follows, {"words": f"the session is {follows.state}"})
+            failure = self._notify(follows, {"words": f"the session is {follows.state}"})
             self._keep(follows, "waiting", {"told_of": follows.state, "told": failure})
 
     def _end(self, follows: _Following, state: str, then: dict[str, Any], words: str) -> None:
         kept = {key: value for key, value in then.items() if key != "told_of"} | {"words": words}
-        self._keep(follows, state, kept | {"told": self._told(follows, kept | {"then": state})})
+        self._keep(follows, state, kept | {"told": self._notify(follows, kept | {"then": state})})
 
-    def _told(self, follows: _Following, more: dict[str, Any]) -> str | None:
+    def _notify(self, follows: _Following, more: dict[str, Any]) -> str | None:
         url = follows.asked.webhook
         if url is None:
             return None

@@ -54,8 +54,13 @@ def check_room(folder: Path, wanted_bytes: int) -> None:
 
 
 def inside(name: str) -> PurePosixPath:
-    """Return a member's name as a path in the folder. Raises InputError for a path that leads out of it, and for a name
-    that some system couldn't keep."""
+    """Return a member's name as a path in the folder.
+
+    Raises InputError for a path that leads out of it, and for a name that some system couldn't keep.
+
+    >>> inside("frames/dark-1.npy")
+    PurePosixPath('frames/dark-1.npy')
+    """
     path = PurePosixPath(name)
     parts = path.parts
     causes = {
@@ -206,7 +211,7 @@ _BROKEN = (
 
 
 @contextlib.contextmanager
-def _opened(archive: Path, limit_bytes: int, limit_files: int) -> Iterator[_Archive]:
+def _open(archive: Path, limit_bytes: int, limit_files: int) -> Iterator[_Archive]:
     """The archive, by its first bytes."""
     listed_bytes = max(CHUNK, limit_files * _LISTED_BYTES)
     with archive.open("rb") as file:
@@ -230,8 +235,8 @@ def unpack(archive: Path, folder: Path, limit_bytes: int, limit_files: int) -> t
     """Unpack a .zip, .tar or .tar.gz into `folder`, which must not exist; returns remarks on what isn't taken as it is
     in the archive. Raises InputError, and TooMuch beyond a limit."""
     try:
-        with _opened(archive, limit_bytes, limit_files) as opened:
-            members, remarks = _checked(opened, folder.parent, limit_bytes, limit_files)
+        with _open(archive, limit_bytes, limit_files) as opened:
+            members, remarks = _check_members(opened, folder.parent, limit_bytes, limit_files)
             check_ratio(archive, sum(member.size_bytes for member, _ in members))
             _write(opened, members, folder, limit_bytes)
             return remarks
@@ -240,7 +245,7 @@ def unpack(archive: Path, folder: Path, limit_bytes: int, limit_files: int) -> t
 
 
 def most_bytes(archive: Path) -> int:
-    """Bytes that an archive of this size may hold."""
+    """Return the bytes that an archive of this size may hold."""
     return MOST_RATIO * archive.stat().st_size + FREE_BYTES
 
 
@@ -291,7 +296,7 @@ def _is_of_the_system(path: PurePosixPath) -> bool:
 _OF_SYSTEMS = frozenset((".DS_Store", "Thumbs.db", "desktop.ini"))
 
 
-def _checked(
+def _check_members(
     opened: _Archive, room: Path, limit_bytes: int, limit_files: int
 ) -> tuple[list[tuple[_Member, PurePosixPath]], tuple[str, ...]]:
     """Return the archive's members and their paths, all checked by what the archive states of them, and remarks."""

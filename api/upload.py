@@ -38,12 +38,19 @@ _MODEL_FILES = 64
 
 
 def is_recordings(source: str) -> bool:
-    """Return whether an id is one of recordings that were sent in, not of a session."""
+    """Return whether an id is one of recordings that were sent in, not of a session.
+
+    >>> is_recordings("20300101-101500-7f3ad2")
+    False
+    """
     return _ID.fullmatch(source) is not None
 
 
 def check_size(size_bytes: int, limit_bytes: int) -> None:
-    """Raises TooMuch for an archive, stated or received, beyond the limit."""
+    """Check the size of an archive, stated or received. Raises TooMuch beyond the limit.
+
+    >>> check_size(100, 1000)
+    """
     if size_bytes > limit_bytes:
         raise TooMuch(f"the archive is larger than {limit_bytes} bytes; send less at a time")
 
@@ -136,7 +143,7 @@ class Inbox:
     root: Path
 
     def ids(self) -> list[str]:
-        """Ids of all, the newest first."""
+        """Return the ids of all, the newest first."""
         entries = [entry for entry in self.root.glob("*") if _ID.fullmatch(entry.name) and entry.is_dir()]
         return [entry.name for entry in sorted(entries, key=lambda entry: (-entry.stat().st_mtime_ns, entry.name))]
 
@@ -154,7 +161,7 @@ class Inbox:
 
     @contextlib.contextmanager
     def receiving(self) -> Iterator[Path]:
-        """A temporary folder for an archive while it arrives."""
+        """Yield a temporary folder for an archive while it arrives."""
         self.root.mkdir(parents=True, exist_ok=True)
         for left in self.root.glob(".*-*"):  # what a crash left
             if left.lstat().st_mtime < time.time() - _STALE_S:
@@ -205,7 +212,7 @@ class Inbox:
         return manifest
 
     def recordings(self, id: str) -> RecordingSet:
-        """Kept recordings, whose frames are checked when they are read."""
+        """Return kept recordings, whose frames are checked when they are read."""
         folder = self.folder(id)
         manifest, _ = recording.parse_manifest((folder / _MANIFEST).read_text(encoding="utf-8-sig"), _MANIFEST)
         return RecordingSet(manifest, source=id, files=FolderFiles(folder))
@@ -251,8 +258,8 @@ def _top(folder: Path, holds: str | None = _MANIFEST) -> Path:
     file is beside it."""
     entries = list(folder.iterdir())
     inner = [entry for entry in entries if entry.is_dir()]
-    here = (folder / holds).exists() if holds is not None else len(entries) > 1
-    return inner[0] if not here and len(inner) == 1 else folder
+    is_holder = (folder / holds).exists() if holds is not None else len(entries) > 1
+    return inner[0] if not is_holder and len(inner) == 1 else folder
 
 
 def as_in_archive(text: str, place: Path) -> str:

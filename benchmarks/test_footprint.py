@@ -19,7 +19,7 @@ import pytest
 
 from api.client import ServiceClient
 from api.keys import Permission, create_key
-from api.pytest_plugin import service_process
+from api.local_service import service_process
 from api.schemas import SessionStart, Then
 from benchmarks.process_memory import MemoryWatch, by_kind
 from benchmarks.table import Row, show

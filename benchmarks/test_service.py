@@ -29,7 +29,7 @@ import sqlalchemy as sa
 from api.app import ASSETS
 from api.client import ServiceClient
 from api.keys import Permission, create_key
-from api.pytest_plugin import service_process
+from api.local_service import service_process
 from api.schemas import SessionStart
 from benchmarks.table import Row, show
 from lab.bench_process import mock_bench

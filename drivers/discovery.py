@@ -44,7 +44,7 @@ class Found:
 
 
 def find_all(usbip: str = "") -> Iterator[Found]:
-    """Everything found: USB devices (and those that a USB/IP server `HOST[:PORT]` exports), cameras of installed
+    """Yield everything found: USB devices (and those that a USB/IP server `HOST[:PORT]` exports), cameras of installed
     libraries, serial ports."""
     yield from usb_devices()
     if usbip:

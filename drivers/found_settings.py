@@ -30,8 +30,9 @@ _thread = threading.local()
 
 @contextmanager
 def making_safe() -> Iterator[None]:
-    """Within it, in this thread, an instrument is made safe also where nothing can be kept on disk: what it was set to
-    is kept in memory alone, for as long as its driver lives."""
+    """Make an instrument safe, within the block and in this thread, also where nothing can be kept on disk: what it was
+    set to is kept in memory alone, for as long as its driver lives.
+    """
     before = getattr(_thread, "makes_safe", False)
     _thread.makes_safe = True
     try:
@@ -66,7 +67,7 @@ class Hold:
         self._taken = taken
 
     def let_go(self) -> None:
-        """Others may use it."""
+        """Release the hold: others may use the instrument."""
         taken, self._taken = self._taken, None
         if taken is not None:
             taken.close()
@@ -102,7 +103,7 @@ class FoundSettings:
         return bool(self._values)
 
     def last_first(self) -> Iterator[tuple[str, Setting]]:
-        """(name, value) of each, what was changed last first."""
+        """Yield (name, value) of each, what was changed last first."""
         return iter(list(reversed(self._values.items())))
 
     @property
@@ -127,8 +128,9 @@ class FoundSettings:
                 log.warning("%s; its instrument is made safe all the same", error)
 
     def forget(self, name: str) -> None:
-        """A value is set as it was found. Where the file can't be changed, it stays: whoever connects next sets the
-        value once more."""
+        """Note that a value is set as it was found. Where the file can't be changed, it stays: whoever connects next
+        sets the value once more.
+        """
         if self._values.pop(name, None) is not None:
             try:
                 self._write()

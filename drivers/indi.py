@@ -255,15 +255,15 @@ class IndiDevice:
         return self._vectors[name].values.get(element, "") if name in self._vectors else ""
 
     def state(self, name: str) -> str:
-        """`Idle`, `Ok`, `Busy` or `Alert`."""
+        """Return `Idle`, `Ok`, `Busy` or `Alert`."""
         return self._vector(name).state
 
     def entries(self, name: str) -> tuple[str, ...]:
-        """Names of a property's elements."""
+        """Return the names of a property's elements."""
         return tuple(self._vector(name).values)
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Least and greatest value of `PROPERTY.ELEMENT`."""
+        """Return least and greatest value of `PROPERTY.ELEMENT`."""
         vector, _, element = name.partition(".")
         return self._vector(vector).limits[element]
 
@@ -319,7 +319,7 @@ class IndiDevice:
         self._send(f"<enableBLOB device={quoteattr(self.name)}>Also</enableBLOB>")
 
     def forget_blob(self, name: str) -> None:
-        """What came before isn't wanted."""
+        """Forget the pictures that came before."""
         self._vector(name).blob = None
 
     def blob(self, name: str, wait_s: float) -> bytes | None:
@@ -334,5 +334,5 @@ class IndiDevice:
         return Identity(self.text(info, "DRIVER_EXEC"), self.name, "", self.text(info, "DRIVER_VERSION"))
 
     def settings(self) -> dict[str, Setting]:
-        """All of its properties that aren't pictures."""
+        """Return all of its properties that aren't pictures."""
         return {name: self.get(name) for name, vector in self._vectors.items() if vector.kind not in ("BLOB", "Light")}

@@ -39,10 +39,10 @@ class Instrument(ABC):
 
     @abstractmethod
     def identity(self) -> Identity:
-        """Maker, model, serial number and firmware as the instrument reports them."""
+        """Return maker, model, serial number and firmware as the instrument reports them."""
 
     def settings(self) -> Mapping[str, Setting]:
-        """Every setting that bears on what is measured, by its name, as the instrument reports it now."""
+        """Return every setting that bears on what is measured, by its name, as the instrument reports it now."""
         return {}
 
     def found(self) -> Mapping[str, Setting]:

@@ -17,18 +17,35 @@ GROUP = "calibench.drivers"
 
 
 def names(family: str) -> tuple[str, ...]:
-    """Names of the drivers of one family ("monochromator", "camera", ...), sorted."""
+    """Return the names of the installed drivers of one family, sorted.
+
+    family : `camera`, `display`, `light_source`, `monochromator`, `photodiode`, `spectroradiometer` or `stage`
+
+    >>> "cornerstone260" in names("monochromator")
+    True
+    """
     return tuple(sorted(name.partition(".")[2] for name in _all() if name.partition(".")[0] == family))
 
 
 def drivers() -> tuple[tuple[str, str], ...]:
-    """(family, name) of every driver that is installed, sorted."""
+    """Return (family, name) of every driver that is installed, sorted.
+
+    >>> ("stage", "prompt") in drivers()
+    True
+    """
     return tuple(sorted((name.partition(".")[0], name.partition(".")[2]) for name in _all()))
 
 
 def driver(family: str, name: str) -> Callable[..., Any]:
-    """Return what makes the instrument: call it with an address. Raises `InstrumentError` if there is no such
-    driver."""
+    """Return what makes an instrument: call it with an address.
+
+    family, name : as `drivers` lists them
+
+    Raises `InstrumentError` if there is no such driver, or where it can't be loaded.
+
+    >>> driver("monochromator", "cm110").__name__
+    'Cm110'
+    """
     point = _all().get(f"{family}.{name}")
     if point is None:
         known = ", ".join(names(family)) or "none"

@@ -35,7 +35,15 @@ class Piece:
 
 
 def parse(text: str) -> Iterator[list[Piece]]:
-    """Conversations of a transcript. Raises `ValueError` with the line's number for a line that is none."""
+    r"""Yield the conversations of a transcript, blank lines between.
+
+    text : lines that begin with `> ` (sent), `< ` (received) or `#`
+
+    Raises `ValueError` with the line's number for another line.
+
+    >>> [len(conversation) for conversation in parse("> ?ID\n< CS260\n\n> STOP\n")]
+    [2, 1]
+    """
     conversation: list[Piece] = []
     for number, line in enumerate([*text.splitlines(), ""], 1):
         if not line.strip():

@@ -143,14 +143,16 @@ class Transport:
         self._record("sent", data)
 
     def read(self, count: int, timeout_s: float | None = None, asked: str = "") -> bytes:
-        """Exactly `count` bytes. Raises `NoAnswer` with what was received instead, `Disconnected`, `Interrupted`."""
+        """Return exactly `count` bytes. Raises `NoAnswer` with what was received instead, `Disconnected`,
+        `Interrupted`.
+        """
         deadline = self._deadline(timeout_s)
         while len(self._received) < count:
             self._fill(deadline, asked)
         return self._take(count)
 
     def read_until(self, end: bytes, timeout_s: float | None = None, asked: str = "") -> bytes:
-        """Everything up to and including the next `end`. Raises `NoAnswer`, `Disconnected`, `Garbled` or
+        """Return everything up to and including the next `end`. Raises `NoAnswer`, `Disconnected`, `Garbled` or
         `Interrupted`."""
         deadline = self._deadline(timeout_s)
         while True:

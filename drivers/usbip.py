@@ -113,7 +113,7 @@ class Configuration:
 
     @classmethod
     def parse(cls, data: bytes) -> Configuration:
-        """From GET_DESCRIPTOR's bytes. Class-specific descriptors go to `extra_descriptors` of what they follow."""
+        """Parse GET_DESCRIPTOR's bytes. Class-specific descriptors go to `extra_descriptors` of what they follow."""
         configuration = cls(_descriptor(_CONFIGURATION, data, extra_descriptors=[]))
         owner = configuration.descriptor
         endpoints: list[Descriptor] = []
@@ -136,7 +136,7 @@ class Configuration:
         return configuration
 
     def interfaces(self) -> list[int]:
-        """Interface numbers, ascending."""
+        """Return the interface numbers, ascending."""
         return sorted({number for number, _ in self.settings})
 
 
@@ -153,7 +153,7 @@ class RemoteDevice:
     _parsed: list[Configuration] = field(default_factory=list)
 
     def configuration(self, index: int) -> Configuration:
-        """Parsed configuration `index`. Raises IndexError past the last, which ends pyusb's iteration."""
+        """Return the parsed configuration `index`. Raises IndexError past the last, which ends pyusb's iteration."""
         if not self._parsed:
             self._parsed = [Configuration.parse(data) for data in self.configurations]
         return self._parsed[index]
@@ -164,21 +164,34 @@ class Pipe:
 
     @abstractmethod
     def submit(self, endpoint: int, setup: bytes, data: bytes | None, length: int, timeout_ms: int) -> bytes:
-        """One transfer. `endpoint` with its direction bit; `setup` (8 bytes) for endpoint 0; `data` of an OUT transfer,
-        None for IN of `length` bytes. Returns what came (IN). Raises `usb.core.USBError` or `USBTimeoutError`."""
+        """Submit one transfer. `endpoint` with its direction bit; `setup` (8 bytes) for endpoint 0; `data` of an OUT
+        transfer, None for IN of `length` bytes. Returns what came (IN). Raises `usb.core.USBError` or
+        `USBTimeoutError`.
+        """
 
     @abstractmethod
     def close(self) -> None:
         """Release the device."""
 
 
-def timed_out() -> usb.core.USBTimeoutError:
-    """Return the exception that pyusb's own backends raise on a time-out."""
+def timeout_error() -> usb.core.USBTimeoutError:
+    """Return the exception that pyusb's own backends raise on a time-out.
+
+    >>> timeout_error().errno == errno.ETIMEDOUT
+    True
+    """
     return usb.core.USBTimeoutError("Operation timed out", error_code=-7, errno=errno.ETIMEDOUT)
 
 
-def failed(status: int, what: str) -> usb.core.USBError:
-    """Return a USB error of an errno (positive)."""
+def usb_error(status: int, what: str) -> usb.core.USBError:
+    """Return a USB error.
+
+    status : errno, positive
+    what : beginning of the message
+
+    >>> str(usb_error(errno.ENODEV, "the camera"))
+    '[Errno 19] the camera: ENODEV'
+    """
     return usb.core.USBError(f"{what}: {errno.errorcode.get(status, status)}", errno=status)
 
 
@@ -190,7 +203,7 @@ class PipeBackend(IBackend):  # type: ignore[misc]  # pyusb is untyped
 
     @abstractmethod
     def devices(self) -> Sequence[RemoteDevice]:
-        """Devices that are connected now."""
+        """Return the devices that are connected now."""
 
     @abstractmethod
     def open_pipe(self, device: RemoteDevice) -> Pipe:
@@ -276,10 +289,10 @@ class PipeBackend(IBackend):  # type: ignore[misc]  # pyusb is untyped
         self._request(dev_handle, 0x01, 11, altsetting, intf)
 
     def claim_interface(self, dev_handle: Pipe, intf: int) -> None:
-        """Nothing to do: an open device is held with all of its interfaces."""
+        """Do nothing: an open device is held with all of its interfaces."""
 
     def release_interface(self, dev_handle: Pipe, intf: int) -> None:
-        """Nothing to do, as for claiming."""
+        """Do nothing, as for claiming."""
 
     def clear_halt(self, dev_handle: Pipe, ep: int) -> None:
         self._request(dev_handle, 0x02, 1, 0, ep)
@@ -291,10 +304,10 @@ class PipeBackend(IBackend):  # type: ignore[misc]  # pyusb is untyped
         return False
 
     def detach_kernel_driver(self, dev_handle: Pipe, intf: int) -> None:
-        """Nothing to do: no kernel driver of this computer holds the device."""
+        """Do nothing: no kernel driver of this computer holds the device."""
 
     def attach_kernel_driver(self, dev_handle: Pipe, intf: int) -> None:
-        """Nothing to do, as for detaching."""
+        """Do nothing, as for detaching."""
 
     def _read(self, dev_handle: Pipe, ep: int, intf: int, buff: array[int], timeout: int) -> int:
         data = dev_handle.submit(ep, bytes(8), None, len(buff) * buff.itemsize, timeout)
@@ -339,7 +352,7 @@ class _PendingUrb:
 
 
 def receive_exactly(connection: socket.socket, count: int) -> bytes:
-    """`count` bytes of a stream. Raises ConnectionError if it ends before."""
+    """Return `count` bytes of a stream. Raises ConnectionError if it ends before."""
     data = bytearray(count)
     view = memoryview(data)
     at = 0
@@ -371,7 +384,7 @@ class TcpPipe(Pipe):
         urb = _PendingUrb(incoming)
         with self._lock:
             if self._closed:
-                raise failed(errno.ENODEV, "the USB/IP connection is closed")
+                raise usb_error(errno.ENODEV, "the USB/IP connection is closed")
             number = next(self._sequence)
             self._pending[number] = urb
             size = length if data is None else len(data)
@@ -382,17 +395,17 @@ class TcpPipe(Pipe):
                 self._socket.sendall(head + SUBMIT.pack(0, size, 0, NOT_ISOCHRONOUS, 0, setup) + (data or b""))
             except OSError as error:
                 self._pending.pop(number, None)
-                raise failed(errno.ENODEV, f"the USB/IP connection broke ({error})") from error
+                raise usb_error(errno.ENODEV, f"the USB/IP connection broke ({error})") from error
         if not urb.done.wait(timeout_ms / 1000 if timeout_ms > 0 else None):
             self._unlink(number, urb)
             if urb.status == -errno.ECONNRESET or not urb.done.is_set():
-                raise timed_out()
+                raise timeout_error()
         if urb.status == -errno.ETIMEDOUT:
-            raise timed_out()
+            raise timeout_error()
         if urb.status:
-            raise failed(-urb.status, f"USB transfer on endpoint {endpoint:#04x}")
+            raise usb_error(-urb.status, f"USB transfer on endpoint {endpoint:#04x}")
         if len(urb.data) > length and incoming:
-            raise failed(errno.EOVERFLOW, f"USB transfer on endpoint {endpoint:#04x}")
+            raise usb_error(errno.EOVERFLOW, f"USB transfer on endpoint {endpoint:#04x}")
         return urb.data
 
     def _unlink(self, number: int, urb: _PendingUrb) -> None:
@@ -470,7 +483,7 @@ class UsbIpBackend(PipeBackend):
         try:
             connection = socket.create_connection((self.host, self.port), self.timeout_s)
         except OSError as error:
-            raise failed(
+            raise usb_error(
                 errno.ENODEV, f"no USB/IP server at {self.host}:{self.port} ({error.strerror or error})"
             ) from error
         try:
@@ -478,16 +491,16 @@ class UsbIpBackend(PipeBackend):
             connection.sendall(OP_HEADER.pack(VERSION, command, 0) + body)
             version, answer, status = OP_HEADER.unpack(receive_exactly(connection, OP_HEADER.size))
             if version != VERSION or answer != command & 0x7FFF:
-                raise failed(
+                raise usb_error(
                     errno.EPROTO, f"{self.host}:{self.port} answered {version:#06x} {answer:#06x}: not USB/IP 1.1.1"
                 )
             if status:
-                raise failed(errno.EBUSY, f"{self.host}:{self.port} refused the device with status {status}")
+                raise usb_error(errno.EBUSY, f"{self.host}:{self.port} refused the device with status {status}")
         except OSError as error:
             connection.close()
             if isinstance(error, usb.core.USBError):
                 raise
-            raise failed(errno.EPROTO, f"no answer from {self.host}:{self.port} ({error})") from error
+            raise usb_error(errno.EPROTO, f"no answer from {self.host}:{self.port} ({error})") from error
         return connection
 
     def devices(self) -> list[RemoteDevice]:
@@ -501,7 +514,7 @@ class UsbIpBackend(PipeBackend):
                     bus_id = fields[1].split(b"\0", 1)[0]
                     devices.append(RemoteDevice(fields[2], fields[3], fields[4], bus_id))
             except OSError as error:
-                raise failed(errno.EPROTO, f"the list of {self.host}:{self.port} broke off ({error})") from error
+                raise usb_error(errno.EPROTO, f"the list of {self.host}:{self.port} broke off ({error})") from error
         return devices
 
     def open_pipe(self, device: RemoteDevice) -> TcpPipe:
@@ -517,7 +530,7 @@ class UsbIpBackend(PipeBackend):
             receive_exactly(connection, DEVICE.size)
         except OSError as error:
             connection.close()
-            raise failed(errno.EPROTO, f"{self.host}:{self.port} broke off ({error})") from error
+            raise usb_error(errno.EPROTO, f"{self.host}:{self.port} broke off ({error})") from error
         connection.settimeout(
             None
         )  # the thread waits for as long as the device is open; requests have their own time-outs
@@ -574,7 +587,11 @@ def open_device(address: str) -> usb.core.Device:
 
 
 def in_words(error: usb.core.USBError) -> str:
-    """Return what an error says, without its number before and its name behind."""
+    """Return what an error says, without its number before and its name behind.
+
+    >>> in_words(usb_error(errno.ENODEV, "the camera"))
+    'the camera'
+    """
     return re.sub(r"^\[Errno -?\d+\] |: E[A-Z]+$", "", str(error))
 
 

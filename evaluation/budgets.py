@@ -79,7 +79,7 @@ def _checked(use: str, linear: LinearUse, errors: Mapping[str, float]) -> Budget
     }
     if len(groups) < 2:
         return None
-    told = {name: linear.told_by(members) for name, members in groups.items()}
+    told = {name: linear.propagate_errors(members) for name, members in groups.items()}
     known = sorted({i for members in groups.values() for i in members})
     covariance = linear.covariance[np.ix_(known, known)]
     z = np.random.default_rng(SEED).multivariate_normal(np.zeros(len(known)), covariance, DRAWS, method="eigh")

@@ -33,7 +33,7 @@ from lab.formats.recording_set import RecordingSet
 from lab.one_blas_thread import one_blas_thread
 from lab.twin.changes import Changes
 from lab.twin.predict import predict
-from lab.twin.score import TestedEffect, TwinScore, score, title, together
+from lab.twin.score import TestedEffect, TwinScore, combine_sessions, score, title
 from lab.twin.sealed import open_seal, seal
 from sim.effects.library import effects as library
 from sim.parameters import Frozen
@@ -259,7 +259,7 @@ def run_case(case: str, seed: int = SEED) -> CameraRun:
     lenses.cleanup()
     return CameraRun(
         case=case, seed=seed, concealed=tuple(law.name for law in laws), told=tuple(e.name for e in
-        found.result.effects), tested=together(tests), transfers=runs, budget=budget, failed=failed,
+        found.result.effects), tested=combine_sessions(tests), transfers=runs, budget=budget, failed=failed,
         cpu_s=time.process_time() - began_s,
     )  # fmt: skip
 

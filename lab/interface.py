@@ -328,13 +328,13 @@ def predict(
     >>> {number.quantity for number in prediction.sides["left"].numbers}
     {'dark'}
     """
-    from lab.twin.changes import checked_changes
+    from lab.twin.changes import validate_changes
     from lab.twin.predict import predict as predicted
 
     return predicted(
         cameras,
         _opened(plan),
-        checked_changes(change or {}, "change "),
+        validate_changes(change or {}, "change "),
         model=", ".join(one.name for one in cameras.values()),
         fitted=None if fitted is None else _opened(fitted),
     )

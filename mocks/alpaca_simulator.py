@@ -22,11 +22,11 @@ def _no_sky() -> ModuleType:
         rows, cols = camera.height // camera.bin_y, camera.width // camera.bin_x
         return np.random.default_rng(1).integers(900, 1100, (rows, cols)).astype(np.uint16)
 
-    def keep(**told: Any) -> SimpleNamespace:
-        return SimpleNamespace(**told)
+    def keep(**attributes: Any) -> SimpleNamespace:
+        return SimpleNamespace(**attributes)
 
     def observatory(camera: SimpleNamespace, site: Any, telescope: Any) -> SimpleNamespace:
-        return SimpleNamespace(generate_image=lambda **told: picture(camera))
+        return SimpleNamespace(generate_image=lambda **arguments: picture(camera))
 
     stand_in.Camera = stand_in.Site = stand_in.Telescope = keep  # type: ignore[attr-defined]
     stand_in.Observatory = observatory  # type: ignore[attr-defined]

@@ -38,13 +38,20 @@ class ConcealError(ValueError):
 
 
 def parse(specs: Iterable[str]) -> Concealed:
-    """Effects by side. Raises `ConcealError` that names the effect, the parameter or the limit, and what may be
-    chosen."""
+    """Return the effects that a bench conceals, by side.
+
+    specs : `SIDE:EFFECT[:PARAMETER=VALUE,...]` each; the side is left, right or both
+
+    Raises `ConcealError` that names the effect, the parameter or the limit, and what may be chosen.
+
+    >>> [effect.name for effect in parse(["left:defocus:defocus_um=10"])["left"]]
+    ['defocus']
+    """
     by_side: dict[Side, tuple[Effect, ...]] = {"left": (), "right": ()}
     for spec in specs:
         sides, effect = _parse(spec.strip())
         for side in sides:
-            if any(type(other) is type(effect) for other in by_side[side]):
+            if any(type(acting) is type(effect) for acting in by_side[side]):
                 raise ConcealError(f"--conceal {spec}: {effect.name} is concealed on the {side} already; give it once")
             by_side[side] = (*by_side[side], effect)
     return by_side
@@ -67,10 +74,10 @@ def _parse(spec: str) -> tuple[tuple[Side, ...], Effect]:
     kind = library()[name]
     if "light" in kind.stages() and sides != SIDES:
         raise ConcealError(f"--conceal {spec}: {name} is of the rig before both cameras; write both:{name}:{text}")
-    return sides, _made(spec, kind, text)
+    return sides, _make_effect(spec, kind, text)
 
 
-def _made(spec: str, kind: type[Effect], text: str) -> Effect:
+def _make_effect(spec: str, kind: type[Effect], text: str) -> Effect:
     quantities = kind.quantities()
     names = (*quantities, *(name for name, field in kind.choices().items() if _is_one_value(field.annotation)))
     known = ", ".join(names)

@@ -52,23 +52,23 @@ class Lamp:
         self.targets: tuple[str, ...] = ("cap", "sphere", "colorchecker", "screen")
 
     def radiance(self) -> Spectrum:
-        """Spectral radiance (W sr^-1 m^-2 nm^-1) of the white surface, 340..1100 nm."""
+        """Return the spectral radiance (W sr^-1 m^-2 nm^-1) of the white surface, 340..1100 nm."""
         return self._radiance
 
     def set_wavelength(self, nm: float) -> None:
-        """No monochromator stands in its light."""
+        """Do nothing: no monochromator stands in its light."""
 
     def set_shutter(self, opened: bool) -> None:
-        """It burns on."""
+        """Do nothing: it burns on."""
 
     def set_filter(self, place: int) -> None:
-        """No wheel."""
+        """Do nothing: there is no wheel."""
 
     def set_slit_um(self, width_um: float) -> None:
-        """No slit."""
+        """Do nothing: there is no slit."""
 
     def set_leds(self, shares: Mapping[int, float]) -> None:
-        """No sphere that they could light."""
+        """Do nothing: there is no sphere that they could light."""
 
     def place(self, name: str) -> None:
         """Remember what was placed; raises `ValueError` for a name that isn't among the targets."""
@@ -77,7 +77,7 @@ class Lamp:
         self.placed = name
 
     def show(self, pattern: object, cell_px: int = 1) -> None:
-        """No screen."""
+        """Do nothing: there is no screen."""
 
 
 @cache
@@ -89,8 +89,12 @@ def _colour_matching(first_nm: float, last_nm: float) -> FloatArray:
 
 
 def tristimulus(radiance: Spectrum) -> tuple[float, float, float]:
-    """X, Y, Z (CIE 1931, Y in cd/m2) of a spectral radiance in W sr^-1 m^-2 nm^-1: 683 x sum of L times each
-    function."""
+    """Return X, Y, Z (CIE 1931, Y in cd/m^2) of a radiance in W sr^-1 m^-2 nm^-1: 683 x sum of L times each function.
+
+    >>> from sim.scene.light import illuminant
+    >>> abs(tristimulus(illuminant("D65", 100.0))[1] - 100.0) < 1.0
+    True
+    """
     light = radiance.at(np.arange(360.0, 830.5, 1.0))
     x, y, z = (LUMINOUS_EFFICACY_LM_PER_W * float(np.sum(light * row)) for row in _colour_matching(360.0, 830.0))
     return x, y, z

@@ -51,10 +51,16 @@ class LightSettings:
 
 
 def lamp_radiance(wavelength_nm: FloatArray, temperature_k: float = 3050.0) -> FloatArray:
-    """Radiance (W sr^-1 m^-2 nm^-1) of the sphere's port in zero order with all filters out: a tungsten-halogen lamp.
+    """Return the radiance (W sr^-1 m^-2 nm^-1) of the sphere's port in zero order with all filters out.
+
+    wavelength_nm : (m,)
+    temperature_k : of the tungsten-halogen lamp
 
     Planck's law with the emissivity of tungsten falling from 0.47 to 0.33, behind glass that is opaque below 385 nm and
     a heat filter that is opaque above 730 nm (half-way points), scaled to 0.03 at 560 nm.
+
+    >>> lamp_radiance(np.array([560.0])).round(6).tolist()
+    [0.03]
     """
 
     def shape(w: FloatArray) -> FloatArray:
@@ -67,28 +73,58 @@ def lamp_radiance(wavelength_nm: FloatArray, temperature_k: float = 3050.0) -> F
 
 
 def led_radiance(wavelength_nm: FloatArray, led_nm: int, share: float) -> FloatArray:
-    """Radiance (W sr^-1 m^-2 nm^-1) of the sphere's port by one LED at a share 0..1 of its most: a normal line at its
-    nominal wavelength, whose total is `LED_RADIANCE` whatever its width."""
+    """Return the radiance (W sr^-1 m^-2 nm^-1) of the sphere's port by one LED.
+
+    wavelength_nm : (m,)
+    led_nm : nominal wavelength
+    share : of its most, 0..1
+
+    It is a normal line at the nominal wavelength, whose total is `LED_RADIANCE` whatever its width.
+
+    >>> wavelength_nm = np.arange(300.0, 801.0)
+    >>> bool(np.isclose(np.trapezoid(led_radiance(wavelength_nm, 550, 0.5), wavelength_nm), 0.5 * LED_RADIANCE))
+    True
+    """
     std_nm = LED_FWHM_NM.get(led_nm, USUAL_LED_FWHM_NM) / np.sqrt(8.0 * np.log(2.0))
     line = np.exp(-0.5 * np.square((np.asarray(wavelength_nm, float) - led_nm) / std_nm))
     return np.asarray(share * LED_RADIANCE / (np.sqrt(2.0 * np.pi) * std_nm) * line)
 
 
 def screen_radiance(wavelength_nm: FloatArray) -> FloatArray:
-    """Radiance (W sr^-1 m^-2 nm^-1) of the lit screen: a blue diode and two phosphors, about 300 cd/m^2."""
+    """Return the radiance (W sr^-1 m^-2 nm^-1) of the lit screen: a blue diode and two phosphors, about 300 cd/m^2.
+
+    wavelength_nm : (m,)
+
+    >>> screen_radiance(np.array([450.0])).round(3).tolist()
+    [0.009]
+    """
     w = np.asarray(wavelength_nm, float)
     primaries = ((450.0, 9.0, 0.0090), (532.0, 24.0, 0.0042), (612.0, 17.0, 0.0051))
     return np.asarray(sum(peak * np.exp(-0.5 * ((w - centre) / sd) ** 2) for centre, sd, peak in primaries))
 
 
 def grating_efficiency(wavelength_nm: FloatArray) -> FloatArray:
-    """Share of the light that a 1200 l/mm grating blazed at 500 nm sends into its first order."""
+    """Return the share of the light that a 1200 l/mm grating blazed at 500 nm sends into its first order.
+
+    wavelength_nm : (m,)
+
+    >>> grating_efficiency(np.array([500.0])).tolist()
+    [0.62]
+    """
     w = np.asarray(wavelength_nm, float)
     return np.asarray(0.62 * np.exp(-0.5 * (np.log(w / 500.0) / 0.42) ** 2))
 
 
 def filter_transmittance(place: int, wavelength_nm: FloatArray) -> FloatArray:
-    """Transmittance of one place of the wheel: a long-pass with an edge 6 nm wide, 0.91 above it, 1e-5 below."""
+    """Return the transmittance of one place of the wheel: a long-pass with an edge 6 nm wide, 0.91 above it, 1e-5
+    below.
+
+    place : 1..6; an empty place transmits everything
+    wavelength_nm : (m,)
+
+    >>> filter_transmittance(1, np.array([500.0])).tolist()
+    [1.0]
+    """
     cut_on = FILTER_CUT_ON_NM[place]
     w = np.asarray(wavelength_nm, float)
     if cut_on is None:
@@ -99,8 +135,14 @@ def filter_transmittance(place: int, wavelength_nm: FloatArray) -> FloatArray:
 
 
 def slit_function(wavelength_nm: FloatArray, centre_nm: float, fwhm_nm: float) -> FloatArray:
-    """Transmittance (1 at the centre) of equal entrance and exit slits: a triangle, rounded by aberrations to sigma
-    0.25 nm."""
+    """Return the transmittance (1 at the centre) of equal entrance and exit slits.
+
+    wavelength_nm : (m,)
+    centre_nm, fwhm_nm : of the triangle, which aberrations round to sigma 0.25 nm
+
+    >>> slit_function(np.array([545.0, 555.0]), 550.0, 10.0).round(2).tolist()
+    [0.5, 0.5]
+    """
     w = np.asarray(wavelength_nm, float)
     offsets = np.linspace(-0.75, 0.75, 13)
     weights = np.exp(-0.5 * (offsets / 0.25) ** 2)
@@ -112,7 +154,7 @@ def slit_function(wavelength_nm: FloatArray, centre_nm: float, fwhm_nm: float) -
 
 
 def sphere_radiance(light: LightSettings, wavelength_nm: FloatArray) -> FloatArray:
-    """Radiance (W sr^-1 m^-2 nm^-1) of the sphere's port for a setting of the light path.
+    """Return the radiance (W sr^-1 m^-2 nm^-1) of the sphere's port for a setting of the light path.
 
     Zero order passes all wavelengths. In first order at w the second order of w/2 leaves the slit at the same angle,
     with half the width in wavelength: only the filter wheel keeps it out. Stray light: 1e-6 of zero order. LEDs add

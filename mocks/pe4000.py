@@ -44,7 +44,9 @@ class MockPe4000(Grammar):
                 command = self._line.decode("latin-1").strip()
                 self._line.clear()
                 if command and self._failure() is None:
-                    out += [Reply("\r\n".join([*lines, ""]).encode("ascii"))] if (lines := self._told(command)) else []
+                    out += (
+                        [Reply("\r\n".join([*lines, ""]).encode("ascii"))] if (lines := self._answer(command)) else []
+                    )
             elif len(self._line) < LONGEST_LINE:
                 self._line.append(value)
         return out
@@ -69,7 +71,7 @@ class MockPe4000(Grammar):
     def _channel_of(nm: int) -> str:
         return next(letter for letter, leds in LEDS.items() if nm in leds)
 
-    def _told(self, command: str) -> list[str]:
+    def _answer(self, command: str) -> list[str]:
         """Return the lines of an answer; none to what it doesn't know."""
         known: dict[str, Callable[[], list[str]]] = {
             "XMODEL": lambda: ["XMODEL=pE-4000"],

@@ -27,7 +27,15 @@ BAYER_RG8, BAYER_RG12, BAYER_RG12P = 0x01080009, 0x01100011, 0x010C0059
 
 
 def pack_12p(raw: UInt16Array) -> bytes:
-    """12-bit pixels as a stream of bits, least significant first: two pixels in three bytes."""
+    """Pack 12-bit pixels as a stream of bits, least significant first: two pixels in three bytes.
+
+    raw : (rows, cols), DN
+
+    Source: PFNC, `12p` formats.
+
+    >>> pack_12p(np.array([[0x123, 0x456]], np.uint16)).hex()
+    '236145'
+    """
     flat = np.append(raw.reshape(-1), np.zeros(raw.size % 2, np.uint16)).astype(np.uint32)
     pair = flat[0::2] | (flat[1::2] << 12)
     return (
@@ -38,7 +46,14 @@ def pack_12p(raw: UInt16Array) -> bytes:
 
 
 def payload_bytes(pixel_format: int, pixels: int) -> int:
-    """Size of a frame's payload."""
+    """Return the size of a frame's payload, bytes.
+
+    pixel_format : PFNC code of GenICam, with the bits of a pixel in its second byte from the left
+    pixels : of the frame
+
+    >>> payload_bytes(0x010C0047, 100)  # BayerRG12p
+    150
+    """
     return (pixels * ((pixel_format >> 16) & 0xFF) + 7) // 8
 
 

@@ -19,14 +19,26 @@ _RANGE_A = 0.02
 
 
 def responsivity_a_per_w(wavelength_nm: FloatArray) -> FloatArray:
-    """Return a silicon photodiode's: a quantum efficiency that falls off towards 300 nm and 1100 nm."""
+    """Return the responsivity (A/W) of a silicon photodiode, whose quantum efficiency falls off towards 300 nm and 1100
+    nm.
+
+    wavelength_nm : (m,)
+
+    >>> responsivity_a_per_w(np.array([700.0])).round(2).tolist()
+    [0.48]
+    """
     efficiency = 0.85 / (1.0 + np.exp((wavelength_nm - 1050.0) / 25.0)) / (1.0 + np.exp((330.0 - wavelength_nm) / 20.0))
     return np.asarray(efficiency * wavelength_nm / 1239.84)
 
 
 def calibration_csv(departure_percent: float = 0.8) -> str:
-    """Return the calibration that came with the diode; `departure_percent` is by how much it is off, as real ones
-    are."""
+    """Return the calibration that came with the diode, as its driver reads it.
+
+    departure_percent : by how much it is off, as real ones are
+
+    >>> calibration_csv().splitlines()[0]
+    'wavelength_nm,responsivity_a_per_w'
+    """
     at = np.arange(300.0, 1101.0, 10.0)
     certified = responsivity_a_per_w(at) * (1.0 + departure_percent / 100.0 * np.sin(at / 180.0))
     return (

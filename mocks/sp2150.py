@@ -52,23 +52,23 @@ class MockSp2150(Grammar):
 
     def _end(self) -> list[bytes]:
         self._arrive()
-        return [self._said(self._moving, ""), *self._run()]
+        return [self._reply_to(self._moving, ""), *self._run()]
 
     def _run(self) -> list[bytes]:
         out: list[bytes] = []
         while self._waiting and self._done_at is None:
             command = self._waiting.popleft()
-            text = self._told(command) if self._failure() is None else None
+            text = self._answer(command) if self._failure() is None else None
             if text is not None:
-                out.append(self._said(command, text))
+                out.append(self._reply_to(command, text))
             elif self._done_at is None:
                 out.append(Reply(f"{command if self._echo else ''}  ? \r\n".encode("latin-1", "replace")))
         return out
 
-    def _said(self, command: str, text: str) -> Reply:
+    def _reply_to(self, command: str, text: str) -> Reply:
         return Reply(f"{command if self._echo else ''} {text} ok\r\n".encode("latin-1", "replace"))
 
-    def _told(self, command: str) -> str | None:
+    def _answer(self, command: str) -> str | None:
         """Return the answer; None where there is none yet (a motion), or none at all."""
         known = {
             "MODEL": "SP-2-150i ",

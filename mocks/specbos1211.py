@@ -156,9 +156,9 @@ class MockSpecbos1211(Grammar):
 
     def _last_error(self) -> bytes:
         code, self._error = self._error, 0
-        return self._told("Error Code: ", f"{code}")
+        return self._label_answer("Error Code: ", f"{code}")
 
-    def _told(self, label: str, value: str) -> bytes:
+    def _label_answer(self, label: str, value: str) -> bytes:
         """Return an answer: a spectraval tells the value alone."""
         return f"{'' if self._is_spectraval else label}{value}\r".encode("ascii")
 
@@ -207,18 +207,18 @@ class MockSpecbos1211(Grammar):
         if name == "wavend":
             return b"Predefined end wave: %.1f\r" % self._told_nm[1]
         if name == "spnum":
-            return self._told("spectrometer number: ", self._serial_number)
+            return self._label_answer("spectrometer number: ", self._serial_number)
         if name == "wran":
-            return self._told("wran: ", f"{first_nm:.0f} {last_nm:.0f} {step_nm:.0f}")
+            return self._label_answer("wran: ", f"{first_nm:.0f} {last_nm:.0f} {step_nm:.0f}")
         if name in _SETTINGS:
-            return self._told(f"{name}: ", f"{self._settings[name]:g}")
+            return self._label_answer(f"{name}: ", f"{self._settings[name]:g}")
         raise _SpecbosRefusal(COMMAND)
 
     def _head(self) -> bytes:
         return b"mhead: 0\r"
 
     def _laser_state(self) -> bytes:
-        return self._told("laser: ", f"{self._laser}")
+        return self._label_answer("laser: ", f"{self._laser}")
 
     def _set_laser(self, text: str) -> bytes:
         self._laser = int(text)

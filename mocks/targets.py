@@ -110,14 +110,16 @@ class Pose:
     def before(
         self, camera: HiddenCamera, origin_mm: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[Matrix, tuple[float, float, float]]:
-        """(rotation, translation_mm) of the same plane in the camera's frame, counted from `origin_mm` [x, y]."""
+        """Return (rotation, translation_mm) of the same plane in the camera's frame, from `origin_mm` [x, y] on."""
         corner = self.rotation @ np.array([*origin_mm, 0.0]) + self.centre_mm - camera.centre_mm
         first, second, third = ((float(a), float(b), float(c)) for a, b, c in camera.rotation @ self.rotation)
         x, y, z = (float(v) for v in camera.rotation @ corner)
         return (first, second, third), (x, y, z)
 
     def warp(self, camera: HiddenCamera, unit_mm: float = 1.0, origin_mm: tuple[float, float] = (0.0, 0.0)) -> Warp:
-        """From the target's plane to the camera's px: u, v in units of `unit_mm` from `origin_mm` [x, y]."""
+        """Return the warp from the target's plane to the camera's px: u, v in units of `unit_mm` from `origin_mm` [x,
+        y].
+        """
         rotation, translation_mm = self.before(camera, origin_mm)
         turn = np.asarray(rotation)
         plane = np.column_stack([turn[:, 0] * unit_mm, turn[:, 1] * unit_mm, translation_mm])
@@ -137,12 +139,12 @@ class ShownCells:
     serial: int = 0
 
     def origin_px(self) -> tuple[int, int]:
-        """Row and column of the screen pixel at which the pattern begins."""
+        """Return row and column of the screen pixel at which the pattern begins."""
         rows, cols = (0, 0) if self.pattern is None else self.pattern.shape
         return (SCREEN_ROWS - rows * self.cell_px) // 2, (SCREEN_COLS - cols * self.cell_px) // 2
 
     def lit_share(self) -> float:
-        """Share of lit pixels in a spot of 10 mm at the screen's centre."""
+        """Return the share of lit pixels in a spot of 10 mm at the screen's centre."""
         half = round(5.0 / SCREEN_PITCH_MM)
         if self.pattern is None:
             return 0.0
@@ -175,7 +177,7 @@ def board_pose(name: str) -> Pose:
 
 
 def mm_per_px(camera: HiddenCamera) -> float:
-    """Size of a pixel at the targets' distance, by the data sheet."""
+    """Return the size of a pixel at the targets' distance, by the data sheet."""
     return float(DISTANCE_MM * camera.model.pixel_pitch_um * 1e-3 / camera.model.lens.known_focal_length_mm)
 
 
@@ -242,14 +244,19 @@ def _screen(camera: HiddenCamera, shown: ShownCells) -> Scene:
 
 
 def corners_px(warp: Warp, width: float, height: float) -> FloatArray:
-    """[row, col] of the corners (0, 0), (width, 0), (width, height), (0, height) of a target's plane."""
+    """Return [row, col] of the corners (0, 0), (width, 0), (width, height), (0, height) of a target's plane, px.
+
+    warp : from the plane to the camera's px
+    width, height : of the target, in the plane's unit
+    """
     row, col = warp.to_camera(np.array([0.0, width, width, 0.0]), np.array([0.0, 0.0, height, height]))
     return np.stack([row, col], axis=1)
 
 
 def station_targets(cameras: Mapping[Side, HiddenCamera]) -> dict[str, Any]:
-    """Nominal layout of the targets in the frames, for the station file's `[targets]`: as good as a hand that places
-    them and an eye that reads them off a first picture (corners to half a pixel, regions to the pixel). Keys by target:
+    """Return the nominal layout of the targets in the frames, for the station file's `[targets]`: as good as a hand
+    that places them and an eye that reads them off a first picture (corners to half a pixel, regions to the pixel).
+    Keys by target:
 
     - all: `kind` ("cap" "sphere" "colorchecker" "slanted_edge" "screen" "charuco" "aperture" "turn" ...)
     - colorchecker: `chart`; `[targets.colorchecker.left]` `corners` (4 x [row, col], as in the recording set)
@@ -292,7 +299,7 @@ def station_targets(cameras: Mapping[Side, HiddenCamera]) -> dict[str, Any]:
 
 
 def station_lights() -> dict[str, Any]:
-    """Lights of the light source by name, for the station file's `[light_source.lights]`: `channels`, and
+    """Return the lights of the light source by name, for the station file's `[light_source.lights]`: `channels`, and
     `colour_temperature_k` or `wavelength_nm`."""
     white = {
         f"{kelvin:g} K": {

@@ -22,7 +22,7 @@ _BLACK, _WHITE = 64, 4095
 
 
 def write_dng(file: Path, raw: UInt16Array, exposure_s: float) -> None:
-    """A DNG of an RGGB sensor of 12 bits (Adobe, Digital Negative Specification 1.7.1): its least set of tags."""
+    """Write a DNG of an RGGB sensor of 12 bits (Adobe, Digital Negative Specification 1.7.1): its least set of tags."""
     exposure = Fraction(exposure_s).limit_denominator(10**6)
     tags = [
         (50706, 1, 4, (1, 4, 0, 0), True),  # DNGVersion

@@ -158,7 +158,7 @@ class TriggerLine:
         self._devices.append(device)
 
     def pulse(self, source: U3vDevice, start_s: float) -> None:
-        """An exposure of `source` begins at virtual time `start_s`."""
+        """Tell the wired cameras that an exposure of `source` begins at virtual time `start_s`."""
         if not source.gives_pulses:
             return
         for device in self._devices:
@@ -500,7 +500,7 @@ class U3vDevice(UsbDevice):
             self._stream.clear()
 
     def line_pulse(self, start_s: float) -> None:
-        """A pulse on Line0 at virtual time `start_s`."""
+        """Take a pulse on Line0 at virtual time `start_s`."""
         control = self._get(TRIGGER_CONTROL)
         if control & TRIGGER_ON and self._trigger_source() == SOURCE_LINE:
             self._expose_now(start_s)
@@ -573,8 +573,8 @@ class U3vDevice(UsbDevice):
         payload = encode(raw[top : top + rows, left : left + cols], pixel_format)
         fault = self._failing(*_OF_FRAMES)
         seconds: float | None = None
-        for told in self._faults_of_answer():
-            fault, seconds = _AS_FRAMES[told.kind], told.value
+        for fault_of_answer in self._faults_of_answer():
+            fault, seconds = _AS_FRAMES[fault_of_answer.kind], fault_of_answer.value
         if fault == "missed":
             return
         frame_id, self._frame_id = self._frame_id, self._frame_id + 1

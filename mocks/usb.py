@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
-from drivers.usbip import Pipe, PipeBackend, RemoteDevice, failed, timed_out
+from drivers.usbip import Pipe, PipeBackend, RemoteDevice, timeout_error, usb_error
 from mocks.bench import Bench
 from mocks.cornerstone260b import MockCornerstone260B
 from mocks.ready_frames import BeforeCameras
@@ -34,7 +34,7 @@ SERIAL_NUMBERS = {"left": "CB-U3V-0001", "right": "CB-U3V-0002"}
 
 
 def stereo_pair(bench: BeforeCameras) -> tuple[U3vDevice, U3vDevice]:
-    """Both cameras of a bench, wired to trigger one another."""
+    """Return both cameras of a bench, wired to trigger one another."""
     line = TriggerLine()
     return (
         U3vDevice(bench, "left", SERIAL_NUMBERS["left"], line),
@@ -77,12 +77,12 @@ class InProcessPipe(Pipe):
         try:
             return self._device.transfer(endpoint, setup, data, length, lambda: time.monotonic() > deadline)
         except Abandoned:
-            raise timed_out() from None
+            raise timeout_error() from None
         except UsbFault as fault:
-            raise failed(-fault.status, f"mock USB transfer on endpoint {endpoint:#04x}") from fault
+            raise usb_error(-fault.status, f"mock USB transfer on endpoint {endpoint:#04x}") from fault
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: nothing is held."""
 
 
 class InProcessBackend(PipeBackend):
@@ -259,7 +259,7 @@ class UsbIpServer:
         self._accepting.start()
 
     def url(self, serial_number: str) -> str:
-        """Address of one device, as a station file names it."""
+        """Return the address of one device, as a station file names it."""
         return f"usbip://{self.address[0]}:{self.address[1]}/{serial_number}"
 
     def _accept(self) -> None:

@@ -34,12 +34,22 @@ _LENGTHS = {0x01: 1, 0x02: 5, 0x03: 3, 0x05: 2, 0x09: 1, 0x0A: 3, 0x6A: 4, 0x6B:
 
 
 def wavelength_nm() -> NDArray[np.float64]:
-    """Wavelength of every pixel, (2048,)."""
+    """Return the wavelength of every pixel, (2048,), nm.
+
+    >>> wavelength_nm().shape
+    (2048,)
+    """
     return np.asarray(np.polynomial.polynomial.polyval(np.arange(PIXELS), WAVELENGTH_NM), float)
 
 
 def response(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Counts a second for a radiance of 1 W sr^-1 m^-2 nm^-1: grating and silicon."""
+    """Return the counts a second for a radiance of 1 W sr^-1 m^-2 nm^-1: grating and silicon.
+
+    wavelength : (m,), nm
+
+    >>> bool(response(np.array([540.0]))[0] > response(np.array([900.0]))[0])
+    True
+    """
     blaze = np.exp(-0.5 * ((wavelength - 540.0) / 170.0) ** 2)
     return 4.0e7 * (blaze + 0.03) * (1.0 + 0.02 * np.sin(wavelength / 23.0))
 
@@ -47,8 +57,11 @@ def response(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
 def calibration_csv(departure_percent: float = 0.0) -> str:
     """Return the calibration that a laboratory would have sent with the instrument, as its driver reads it.
 
-    `departure_percent`: by how much it is off, smoothly over the spectrum; real ones are good to about 2 % (half of the
-    expanded uncertainty that calibration laboratories state for spectral radiance).
+    departure_percent : by how much it is off, smoothly over the spectrum; real ones are good to about 2 % (half of the
+        expanded uncertainty that calibration laboratories state for spectral radiance)
+
+    >>> calibration_csv().splitlines()[0]
+    'wavelength_nm,counts_per_s_per_w_sr_m2_nm'
     """
     at = np.arange(350.0, 1001.0, 2.0)
     certified = response(at) * (1.0 + departure_percent / 100.0 * np.sin(at / 90.0))

@@ -118,7 +118,7 @@ class UsbDevice:
     # --- descriptors --------------------------------------------------------------------------------------------------
 
     def string_index(self, text: str) -> int:
-        """Index of a string descriptor with this text, added if it isn't there."""
+        """Return the index of a string descriptor with this text, added if it isn't there."""
         if text not in self._strings:
             self._strings.append(text)
         return self._strings.index(text)
@@ -160,7 +160,7 @@ class UsbDevice:
     # --- transfers ----------------------------------------------------------------------------------------------------
 
     def transfer(self, endpoint: int, setup: bytes, data: bytes | None, length: int, cancelled: Cancelled) -> bytes:
-        """One transfer: `data` of an OUT, None for an IN of at most `length` bytes. Raises `UsbFault`."""
+        """Carry out one transfer: `data` of an OUT, None for an IN of at most `length` bytes. Raises `UsbFault`."""
         if not self.plugged:
             raise Unplugged(self.identity.serial_number)
         if self._silent:
@@ -275,15 +275,15 @@ class UsbDevice:
         raise Stalled(f"request {setup.hex()} isn't known")
 
     def bulk_out(self, endpoint: int, data: bytes, cancelled: Cancelled) -> None:
-        """Data for an OUT endpoint."""
+        """Take data for an OUT endpoint."""
         raise Stalled(f"no endpoint {endpoint:#04x}")
 
     def bulk_in(self, endpoint: int, length: int, cancelled: Cancelled) -> bytes:
-        """At most `length` bytes of an IN endpoint; waits until there are some."""
+        """Return at most `length` bytes of an IN endpoint; waits until there are some."""
         raise Stalled(f"no endpoint {endpoint:#04x}")
 
     def on_reset(self) -> None:
-        """The configuration was set anew."""
+        """Note that the configuration was set anew."""
 
     def on_clear_halt(self, endpoint: int) -> None:
-        """A halt of an endpoint was cleared."""
+        """Note that a halt of an endpoint was cleared."""

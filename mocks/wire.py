@@ -102,11 +102,11 @@ class Grammar(ABC):
         return []
 
     def fail_next(self, code: int | None) -> None:
-        """The next command fails with this code (None: `fault_code`)."""
+        """Let the next command fail with this code (None: `fault_code`)."""
         self._fail_with = self.fault_code if code is None else code
 
     def fail_no_more(self) -> None:
-        """The next command doesn't fail."""
+        """Let the next command not fail."""
         self._fail_with = None
 
     def _failure(self) -> int | None:
@@ -157,15 +157,20 @@ class FaultPlan:
         return bool(self._at or self._onwards)
 
     def of(self, number: int) -> list[Fault]:
-        """Those that break the answer of this number."""
+        """Return those that break the answer of this number."""
         return [*self._at.get(number, ()), *(fault for fault in self._onwards if fault.hits(number))]
 
 
 def parse_faults(spec: str, frames: bool = False) -> tuple[Fault, ...]:
-    """Faults from `KIND[=VALUE][@N[+]]`, several with commas: `half@3`, `late=5@2`, `error=120@1+`. `frames`: those of
-    a camera, too.
+    """Return the faults of a mock's option `--fault`.
+
+    spec : `KIND[=VALUE][@N[+]]`, several with commas: `half@3`, `late=5@2`, `error=120@1+`
+    frames : those of a camera, too
 
     Raises `FaultSpecError`.
+
+    >>> parse_faults("late=5@2")[0].value
+    5.0
     """
     kinds = KINDS + FRAME_KINDS if frames else KINDS
     faults: list[Fault] = []
@@ -212,7 +217,7 @@ class FaultyLine:
         self._arm()
 
     def receive(self, data: bytes) -> list[Output]:
-        """Byte by byte, so that an error meant for one command doesn't hit another that came with it."""
+        """Receive byte by byte, so that an error meant for one command doesn't hit another that came with it."""
         if not self.faults:
             return self._pass(self.grammar.receive(data))
         return list(itertools.chain.from_iterable(self._pass(self.grammar.receive(bytes((b,)))) for b in data))

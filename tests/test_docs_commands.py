@@ -74,6 +74,7 @@ RUN = {
     "docs/reference/rest.md": (),  # test_keys_and_service_on_postgresql
     "docs/reference/rest-recordings.md": (),  # tests/api/routes
     "docs/reference/rest-sessions.md": (),  # tests/api/routes
+    "docs/reference/rest-stations.md": (),  # tests/api/routes
 }
 
 

@@ -11,7 +11,13 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("api", "drivers", "lab", "mocks", "sim")
 #: Modules whose examples need recordings, or a process of their own.
-INTERFACE = ("api.client", "api.local_service", "lab.interface", "lab.report.plots")
+INTERFACE = (
+    "api.client",
+    "api.local_service",
+    "lab.formats.recording_set.folder",
+    "lab.interface",
+    "lab.report.plots",
+)
 
 
 def modules_with_examples() -> list[str]:

@@ -8,7 +8,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
-from api.errors import Conflict, answers, known
+from api.errors import Conflict, answers, find_or_404
 from api.keys import Permission, StoredKey
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import CalibrationDetail, Certify, DraftedLimit, DraftedLimits, FigureName, FigureOfFit, Revoke
@@ -16,7 +16,7 @@ from api.security import REPORT_POLICY, Demand
 from api.service import READ, Here, HexId, Service, SessionId
 from lab.calibration import camera_models, life
 from lab.calibration.life import CalibrationRecord, DriftBoard, History
-from lab.calibration.limits import Figure, figures_of, judged, standing_limits
+from lab.calibration.limits import Figure, figures_of, judge_figures, standing_limits
 from lab.capture.store import Store
 from lab.errors import InputError
 from lab.formats.results import FitResult
@@ -28,7 +28,7 @@ router = APIRouter(tags=["calibrations"])
 
 def _known(service: Service, calibration_id: str) -> CalibrationRecord:
     missing = f"no calibration {calibration_id!r}; GET /api/v1/calibrations lists them"
-    return known(missing, lambda: life.calibration(service.store, calibration_id))
+    return find_or_404(missing, lambda: life.calibration(service.store, calibration_id))
 
 
 @router.get("/calibrations", dependencies=[READ], responses=answers(401, 422) | {200: {"headers": HEADERS}})
@@ -59,7 +59,7 @@ def judged_calibration(service: Service, calibration_id: str) -> CalibrationReco
     standing = standing_limits(service.store.root) if calibration.limits is None else None
     if standing is None:
         return calibration
-    by_limit = judged(life.figures(service.store, calibration.id), standing)
+    by_limit = judge_figures(life.figures(service.store, calibration.id), standing)
     return calibration.model_copy(update={"limits": standing, "judgements": by_limit})
 
 
@@ -76,7 +76,7 @@ def _figures(store: Store, fit: str) -> tuple[Figure, ...]:
     return figures_of(FitResult.model_validate(store.result(fit).document))
 
 
-def _told(service: Service, figures: tuple[Figure, ...]) -> list[FigureOfFit]:
+def _figures_of_fit(service: Service, figures: tuple[Figure, ...]) -> list[FigureOfFit]:
     limits = standing_limits(service.store.root)
     listed = []
     for figure in figures:
@@ -101,13 +101,13 @@ def _newest_figures(service: Service, source: str, what: str) -> list[FigureOfFi
     newest = service.store.newest_results(source)
     if "fit" not in newest:
         raise Conflict(f"{what}: isn't fitted yet; start a job of the kind fit")
-    return _told(service, _figures(service.store, newest["fit"]))
+    return _figures_of_fit(service, _figures(service.store, newest["fit"]))
 
 
 @router.get("/calibrations/{calibration_id}/figures", dependencies=[READ], responses=answers(401, 404, 422))
 def calibration_figures(service: Here, calibration_id: HexId) -> list[FigureOfFit]:
     """Every number of a calibration that has an uncertainty, by the data folder's limits where one concerns it."""
-    return _told(service, life.figures(service.store, _known(service, calibration_id).id))
+    return _figures_of_fit(service, life.figures(service.store, _known(service, calibration_id).id))
 
 
 @router.get("/sessions/{session_id}/figures", dependencies=[READ], responses=answers(401, 404, 409, 422))
@@ -128,7 +128,7 @@ def drafted_limits(service: Here, calibration_id: HexId) -> DraftedLimits:
     """Limits drafted from what the same cameras had before: where the next calibration of an unchanged camera lies with
     99 %. They say what is usual; what a camera has to reach, somebody decides. Nothing is kept."""
     wanted = _known(service, calibration_id).id
-    drafts, whence = life.drafted_limits(service.store, wanted)
+    drafts, whence = life.draft_limits(service.store, wanted)
     words = f"Drafted from {len(whence)} earlier calibrations of these cameras: what is usual for them."
     if wanted in whence:
         others = f" and {len(whence) - 1} earlier" if len(whence) > 1 else " alone"
@@ -170,7 +170,7 @@ def certify_calibration(
     return life.certify(service.store, calibration_id, key.name, limits, accept_warnings=asked.accept_warnings)
 
 
-def _certified(service: Service, calibration_id: str) -> CalibrationRecord:
+def _find_certified(service: Service, calibration_id: str) -> CalibrationRecord:
     calibration = _known(service, calibration_id)
     if calibration.certified is None:
         raise Conflict(f"calibration {calibration_id} is a {calibration.state}; certify it, then it has a certificate")
@@ -186,7 +186,7 @@ def _certified(service: Service, calibration_id: str) -> CalibrationRecord:
 def certificate_of_calibration(service: Here, calibration_id: HexId) -> HTMLResponse:
     """The certificate as a page to print, or to keep as a PDF: limits, figures with their uncertainties, verdict,
     serial numbers, hash. 409 before it is certified."""
-    certified = _certified(service, calibration_id)
+    certified = _find_certified(service, calibration_id)
     try:
         runs = service.public_runs(service.store.runs(certified.session_id))
     except InputError:  # the session was deleted
@@ -200,7 +200,7 @@ def certificate_of_calibration(service: Here, calibration_id: HexId) -> HTMLResp
 )
 def certificate_content(service: Here, calibration_id: HexId) -> Certificate:
     """What the certificate states, and its hashes: whoever has it sees whether it was changed."""
-    return certificate(service.store, _certified(service, calibration_id))
+    return certificate(service.store, _find_certified(service, calibration_id))
 
 
 @router.post("/calibrations/{calibration_id}/revoke", responses=answers(401, 403, 404, 409, 422))

@@ -9,12 +9,12 @@ from typing import Annotated
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
-from api.archives import ARCHIVE, Form, Packed, sent
+from api.archives import ARCHIVE, Form, Packed, stream_archive
 from api.errors import Conflict, answers
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import CameraModels, Comparison, SentCamera
 from api.security import REPORT_POLICY
-from api.sending import BODY, arrived, as_parameters
+from api.sending import BODY, as_parameters, receive_archive
 from api.service import CALIBRATE, READ, Here, HexId, Service, camera_model
 from api.upload import take_cameras
 from lab.calibration import camera_models, life
@@ -74,14 +74,14 @@ async def send_camera_model(
     if asked.lens and not asked.lensfun:
         raise HTTPException(422, "lens: is one of a lensfun file; name that as lensfun, or leave lens out")
     limit = service.limits.model_bytes
-    async with arrived(service, request, limit) as came:
+    async with receive_archive(service, request, limit) as came:
         try:
             content, remarks = await asyncio.to_thread(
                 take_cameras, came.place, came.archive, limit, asked.lensfun, asked.lens
             )
         except InputError as error:
             raise InputError(as_parameters(str(error))) from None
-        warnings = tuple(came.told(remark) for remark in remarks)
+        warnings = tuple(came.name_as_sent(remark) for remark in remarks)
         id = await asyncio.to_thread(camera_models.bring_in, service.store, content)
     response.headers["Location"] = f"/api/v1/camera-models/{id}"
     return (await asyncio.to_thread(_whole, service, id)).model_copy(update={"warnings": warnings})
@@ -120,7 +120,7 @@ def camera_model_archive(service: Here, model_id: HexId, form: Form) -> Response
     if not record.sides:
         raise Conflict(f"camera model {model_id}: no camera file was kept; fit again")
     files = list(camera_models.files(service.store, model_id))
-    return sent(packed(((file.name, file.read_bytes()) for file in files), form), f"camera-{model_id}", form)
+    return stream_archive(packed(((file.name, file.read_bytes()) for file in files), form), f"camera-{model_id}", form)
 
 
 Source = Annotated[
@@ -169,7 +169,7 @@ def _name_of(service: Service, id: str) -> str:
     return id
 
 
-def _compared(service: Service, a: str, b: str) -> ComparisonResult:
+def _compare(service: Service, a: str, b: str) -> ComparisonResult:
     return compare(_fit(service, "a", a), _fit(service, "b", b)).model_copy(update={"a": a, "b": b})
 
 
@@ -187,7 +187,7 @@ def compare_calibrations(
     ] = [],  # noqa: B006  (FastAPI copies it)
 ) -> Comparison:
     """Two calibrations: what changed beyond its uncertainty, as `calibench compare A B` tells it."""
-    result = _compared(service, a, b)
+    result = _compare(service, a, b)
     try:
         failed = failures(result, [FailRule.parse(rule) for rule in fail_on])
     except InputError as error:
@@ -204,5 +204,5 @@ def compare_calibrations(
 def comparison_page(service: Here, a: Source, b: Source) -> HTMLResponse:
     """The comparison with its pictures, one page that needs no network, as `calibench compare --report` writes it."""
     names = {"a": _name_of(service, a), "b": _name_of(service, b)}
-    page = render_comparison(_compared(service, a, b).model_copy(update=names))
+    page = render_comparison(_compare(service, a, b).model_copy(update=names))
     return HTMLResponse(service.public.within(page), headers={"Content-Security-Policy": REPORT_POLICY})

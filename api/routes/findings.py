@@ -16,7 +16,7 @@ router = APIRouter(tags=["jobs"])
 
 
 @functools.lru_cache(maxsize=32)
-def _made(store: Store, diagnosis: str, fit: str | None, validation: str | None) -> DiagnosisFindings:
+def _make_findings(store: Store, diagnosis: str, fit: str | None, validation: str | None) -> DiagnosisFindings:
     """Of kept results, by their ids: they never change, and are long."""
     return findings(
         FitResult.model_validate(store.result(fit).document) if fit else FitResult(source="", cameras={}),
@@ -29,7 +29,7 @@ def _newest(service: Service, source: str, what: str) -> DiagnosisFindings:
     newest = service.store.newest_results(source)
     if "diagnose" not in newest:
         raise Conflict(f"{what}: isn't diagnosed yet; start a job of the kind diagnose")
-    return _made(service.store, newest["diagnose"], newest.get("fit"), newest.get("validate"))
+    return _make_findings(service.store, newest["diagnose"], newest.get("fit"), newest.get("validate"))
 
 
 @router.get("/sessions/{session_id}/findings", dependencies=[READ], responses=answers(401, 404, 409, 422))

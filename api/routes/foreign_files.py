@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Request
 
 from api.errors import answers
 from api.schemas import ForeignSpectra, SentSpectra, SentTable, TableFitted
-from api.sending import BODY, Arrived, arrived, as_parameters
+from api.sending import BODY, Arrived, as_parameters, receive_archive
 from api.service import CALIBRATE, Here
 from api.unpacking import TooMuch
 from api.upload import ForeignFile, as_in_archive, located
@@ -34,10 +34,10 @@ async def read_foreign_spectra(
     def read(came: Arrived) -> ForeignSpectra:
         file = ForeignFile.unpacked(came.place, came.archive, limit).file(asked.path, (".sp", ".ti3", ".txt", ".cgats"))
         found = read_cgats(file)
-        warnings = tuple(came.told(f"{file}: {remark}") for remark in found.remarks)
+        warnings = tuple(came.name_as_sent(f"{file}: {remark}") for remark in found.remarks)
         return ForeignSpectra(quantity=found.quantity, spectra=dict(found.spectra), warnings=warnings)
 
-    async with arrived(service, request, limit) as came:
+    async with receive_archive(service, request, limit) as came:
         return await asyncio.to_thread(_told, came, read)
 
 
@@ -51,9 +51,9 @@ async def fit_foreign_table(service: Here, request: Request, asked: Annotated[Se
         sent = ForeignFile.unpacked(came.place, came.archive, limit)
         table = sent.file(asked.path, (".csv", ".txt", ".tsv"))
         made = fit_table(asked.format, table, located(sent.folder, "camera", asked.camera))
-        return TableFitted(fit=made.fit, warnings=tuple(came.told(remark) for remark in made.remarks))
+        return TableFitted(fit=made.fit, warnings=tuple(came.name_as_sent(remark) for remark in made.remarks))
 
-    async with arrived(service, request, limit) as came:
+    async with receive_archive(service, request, limit) as came:
         return await asyncio.to_thread(_told, came, fit)
 
 

@@ -9,8 +9,8 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from sse_starlette.sse import EventSourceResponse
 
-from api.errors import Conflict, answers, known
-from api.events import described, stream, watched
+from api.errors import Conflict, answers, find_or_404
+from api.events import describe_events, stream, watch_state
 from api.keys import Permission
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart, WorkStep
@@ -49,7 +49,7 @@ def _job(service: Service, info: JobInfo) -> Job:
     )
 
 
-def accepted(service: Service, job_id: str, response: Response) -> Job:
+def answer_with_job(service: Service, job_id: str, response: Response) -> Job:
     """A job that was started just now, and where to look for it."""
     response.headers["Location"] = f"/api/v1/jobs/{job_id}"
     return _job(service, service.jobs.job(job_id))
@@ -87,7 +87,7 @@ def start_session_job(
                 f"session {session_id} is {service.state(info)}, not finished; wait for its end "
                 "or resume it, then start the job; a pipeline does both"
             )
-        return accepted(service, _submit(service, start, session_id), response)
+        return answer_with_job(service, _submit(service, start, session_id), response)
     if start.camera_model is not None:
         raise HTTPException(422, "camera_model: a pipeline fits its own; leave it out, or validate or diagnose with it")
     if start.resolve or info.state != "finished":
@@ -97,7 +97,7 @@ def start_session_job(
     job_id = service.jobs.submit(
         "pipeline", session_id, resolve=limits, capturer=service.live.capturer(station), engine=start.engine
     )
-    return accepted(service, job_id, response)
+    return answer_with_job(service, job_id, response)
 
 
 @router.post(
@@ -118,7 +118,7 @@ def start_pipeline(service: Here, start: PipelineStart, response: Response) -> J
     job_id = service.jobs.submit(
         "pipeline", session_id, resolve=limits, capturer=service.live.capturer(station), engine=start.engine
     )
-    return accepted(service, job_id, response)
+    return answer_with_job(service, job_id, response)
 
 
 @router.post(
@@ -136,7 +136,7 @@ def start_recordings_job(
     key's scope has to be `admin`. 409 while a session runs on it."""
     folder = str(service.recordings(recordings_id))
     if start.station is None and not start.resolve:
-        return accepted(service, _submit(service, start, folder), response)
+        return answer_with_job(service, _submit(service, start, folder), response)
     if start.station is None or not start.resolve or start.kind != "pipeline":
         raise HTTPException(
             422,
@@ -154,7 +154,7 @@ def start_recordings_job(
     job_id = service.jobs.submit(
         "pipeline", folder, resolve=limits, capturer=capturer, station=station_of_set, engine=start.engine
     )
-    return accepted(service, job_id, response)
+    return answer_with_job(service, job_id, response)
 
 
 @router.get(
@@ -207,7 +207,7 @@ def cancel_job(service: Here, job_id: HexId) -> Job:
     dependencies=[READ],
     response_class=EventSourceResponse,
     responses=answers(401, 404, 422)
-    | described(("progress", Job, "at once and at every change"), ("end", Job, "when the job is over")),
+    | describe_events(("progress", Job, "at once and at every change"), ("end", Job, "when the job is over")),
 )
 def job_events(service: Here, job_id: HexId) -> EventSourceResponse:
     """Follow a job."""
@@ -217,7 +217,9 @@ def job_events(service: Here, job_id: HexId) -> EventSourceResponse:
     def look() -> Job:
         return _job(service, service.jobs.job(job_id))
 
-    return stream(lambda stopping: watched(look, lambda job: job.state in over, "progress", stopping, service.changed))
+    return stream(
+        lambda stopping: watch_state(look, lambda job: job.state in over, "progress", stopping, service.changed)
+    )
 
 
 def _done(service: Service, job_id: str) -> JobInfo:
@@ -265,5 +267,5 @@ def job_report(service: Here, job_id: HexId) -> HTMLResponse:
     """The report of a job of the kind `report` or `pipeline`: one page that needs no network, and is given none."""
     if _done(service, job_id).kind not in REPORTS:
         raise HTTPException(404, f"job {job_id} made no report; GET /api/v1/jobs/{job_id}/result")
-    page = known(f"the report of job {job_id} is gone; start it again", lambda: service.report(job_id))
+    page = find_or_404(f"the report of job {job_id} is gone; start it again", lambda: service.report(job_id))
     return HTMLResponse(service.public.within(page), headers={"Content-Security-Policy": REPORT_POLICY})

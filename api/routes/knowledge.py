@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends
 
-from api.errors import answers, known
+from api.errors import answers, find_or_404
 from api.keys import Permission, StoredKey
 from api.schemas import Me
 from api.security import Demand
@@ -43,4 +43,4 @@ def list_effects() -> list[EffectDescription]:
 def get_effect(name: str) -> EffectDescription:
     """One effect."""
     missing = f"no effect {name[:60]!r}; GET /api/v1/effects lists them"
-    return known(missing, lambda: effect_description(name))
+    return find_or_404(missing, lambda: effect_description(name))

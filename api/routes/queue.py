@@ -12,12 +12,12 @@ from fastapi import APIRouter, Depends, HTTPException, Request, Response
 
 from api.errors import Conflict, answers
 from api.keys import StoredKey
-from api.routes.sessions import check_then, registered, stored_session
+from api.routes.sessions import check_then, register_session, stored_session
 from api.safety import StationSafety, key_of
 from api.schemas import Halt, Halted, HaltedStation, QueueEntry, QueuePlace, SessionStart, StoredSession
 from api.security import DemandHalt
 from api.service import OPERATE, OVER, READ, ROOM, Here, Service, SessionId
-from api.then import kept_request
+from api.then import read_request
 from lab.capture.catalogue import step_times
 from lab.capture.queue import expected_times, leave_queue, put_into_queue, queue
 from lab.capture.records import now
@@ -37,7 +37,7 @@ def _duration_s(store: Store, session_id: str, hour: int) -> float:
     return sum(times.seconds(entry.step)[0] for entry in store.journal(session_id) if entry.finished is None)
 
 
-def _told(service: Service) -> list[QueueEntry]:
+def _list_entries(service: Service) -> list[QueueEntry]:
     live, store = service.live, service.store
     waiting = [info for info in queue(store) if live.find(info.id) is None]
     at = now()
@@ -54,14 +54,14 @@ def _told(service: Service) -> list[QueueEntry]:
         at,
     )
     entries = []
-    for place, one in enumerate(waiting, start=1):
-        start, end = expected.get(one.id, (None, None))
-        request = kept_request(store, one.id)
+    for place, waiting_session in enumerate(waiting, start=1):
+        start, end = expected.get(waiting_session.id, (None, None))
+        request = read_request(store, waiting_session.id)
         entries.append(
             QueueEntry(
-                **one.model_dump(exclude={"place", "held"}),
+                **waiting_session.model_dump(exclude={"place", "held"}),
                 place=place,
-                held=service.public.or_none(one.held),
+                held=service.public.or_none(waiting_session.held),
                 expected_start=start,
                 expected_end=end,
                 then=request.then.in_words if request is not None and request.then is not None else None,
@@ -75,7 +75,7 @@ def _told(service: Service) -> list[QueueEntry]:
 def list_queue(service: Here) -> list[QueueEntry]:
     """The sessions that wait for their instruments, in their order. `held`: it doesn't start by itself, because the run
     before it on the same instruments ended badly, or because of a halt."""
-    return _told(service)
+    return _list_entries(service)
 
 
 @router.put("/sessions/{session_id}/queue", dependencies=[OPERATE], responses=answers(401, 403, 404, 409, 422))
@@ -88,7 +88,7 @@ def queue_session(service: Here, session_id: SessionId, asked: QueuePlace) -> li
         raise Conflict(f"session {session_id} is {state}; only one that can be started or resumed can wait")
     put_into_queue(service.store, session_id, asked.not_before, asked.place)
     service.waiting.look_soon()
-    return _told(service)
+    return _list_entries(service)
 
 
 @router.delete("/sessions/{session_id}/queue", dependencies=[OPERATE], responses=answers(401, 403, 404, 409, 422))
@@ -102,7 +102,7 @@ def unqueue_session(service: Here, session_id: SessionId) -> list[QueueEntry]:
         leave_queue(service.store, session_id)
     except InputError as error:
         raise Conflict(str(error)) from None
-    return _told(service)
+    return _list_entries(service)
 
 
 @router.put("/sessions/{session_id}/request", dependencies=[OPERATE, ROOM], responses=answers(401, 403, 404, 409, 422))
@@ -125,7 +125,7 @@ def change_request(
         service.store.delete_session(session_id)
     except InputError as error:
         raise Conflict(str(error)) from None
-    changed = registered(service, start, station)
+    changed = register_session(service, start, station)
     put_into_queue(service.store, changed, start.not_before, waits.place, waits.held)
     service.waiting.look_soon()
     response.headers["Location"] = f"/api/v1/sessions/{changed}"
@@ -173,9 +173,9 @@ def halt(
             }:  # it has no file any more
                 stations[f"session {id}"] = session.station
     answering = list(ended.values())
-    for one in {key_of(one): one for one in stations.values()}.values():
-        if key_of(one) not in busy:
-            answering.append(live.make_safe(one))
+    for idle_station in {key_of(station): station for station in stations.values()}.values():
+        if key_of(idle_station) not in busy:
+            answering.append(live.make_safe(idle_station))
     wait([held], max(0.0, until_s - time.monotonic()))
     later = live.halt(station, why)  # what the queue began in between
     wait([*answering, *later.values()], max(0.0, until_s - time.monotonic()))
@@ -184,9 +184,13 @@ def halt(
         for name, why_not in unusable.items()
         if (words := service.public(f"its station file can't be used, so it wasn't asked: {why_not}"))
     ]
-    for name, one in stations.items():
-        if (found := live.safety.find(one)) is None or (found.state == "halting" and found.shutter == "unknown"):
-            live.safety.note_trouble(one, f"no answer of its shutter within {ANSWER_S:g} s; it is still being asked")
-        if (safety := service.safety(one)) is not None:
+    for name, asked_station in stations.items():
+        if (state := live.safety.find(asked_station)) is None or (
+            state.state == "halting" and state.shutter == "unknown"
+        ):
+            live.safety.note_trouble(
+                asked_station, f"no answer of its shutter within {ANSWER_S:g} s; it is still being asked"
+            )
+        if (safety := service.safety(asked_station)) is not None:
             answers.append(HaltedStation(name=name, safety=safety))
     return Halted(sessions=tuple(dict.fromkeys([*ended, *later])), stations=tuple(answers))

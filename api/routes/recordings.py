@@ -12,11 +12,11 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from api.archives import ARCHIVE, Form, Packed
 from api.errors import answers
 from api.frames import FOR_EVER, Npy, Picture, Stretch, Width, npy_of, picture_of
-from api.kept_sets import sent_set
+from api.kept_sets import find_sent_set
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, WordsOfName, page_headers, page_of
 from api.preview import Form as PictureForm
 from api.schemas import CaptureCount, CaptureKind, RecordedCapture, Recordings, RecordingsDetail, SentAs
-from api.sending import BODY, arrived, as_parameters
+from api.sending import BODY, as_parameters, receive_archive
 from api.service import CALIBRATE, READ, Here, HexId, RegistryId, Service
 from api.unpacking import TooMuch
 from api.upload import Foreign
@@ -84,7 +84,7 @@ async def send_recordings(
     the other parameters state what that format doesn't."""
     foreign = _foreign(asked)
     limits = service.limits
-    async with arrived(service, request, limits.upload_bytes) as sent:
+    async with receive_archive(service, request, limits.upload_bytes) as sent:
         try:
             id, warnings = await asyncio.to_thread(
                 service.inbox.take_in, sent.place, sent.archive, limits.unpacked_bytes, limits.unpacked_files, foreign
@@ -93,7 +93,7 @@ async def send_recordings(
             raise
         except InputError as error:
             raise InputError(as_parameters(str(error)) if foreign is not None else str(error)) from None
-        lines = tuple(sent.told(line) for line in warnings.warnings)
+        lines = tuple(sent.name_as_sent(line) for line in warnings.warnings)
     response.headers["Location"] = f"/api/v1/recordings/{id}"
     return _recordings(id, warnings.manifest.model_dump(include={"name", "notes", "cameras", "captures"}), lines)
 
@@ -127,7 +127,7 @@ def get_recordings(service: Here, recordings_id: HexId) -> RecordingsDetail:
 
 
 def _capture(recordings_id: str, number: int, capture: Capture) -> RecordedCapture:
-    here = f"/api/v1/recordings/{recordings_id}/captures/{number}"
+    address = f"/api/v1/recordings/{recordings_id}/captures/{number}"
     document = capture.model_dump(mode="json", exclude_none=True)
     return RecordedCapture(
         id=number,
@@ -136,8 +136,8 @@ def _capture(recordings_id: str, number: int, capture: Capture) -> RecordedCaptu
         side=capture.side,
         exposure_s=document.get("exposure_s"),
         document=document,
-        preview=f"{here}/preview.png",
-        frame=f"{here}/frame.npy",
+        preview=f"{address}/preview.png",
+        frame=f"{address}/frame.npy",
     )
 
 
@@ -255,7 +255,7 @@ def recorded_figures(service: Here, recordings_id: HexId, number: RegistryId, re
 def recordings_archive(service: Here, recordings_id: HexId, form: Form) -> Response:
     """The recording set as a .zip or .tar, as `POST /recordings` takes it: sent while it is packed, without a stated
     length."""
-    return sent_set(service, recordings_id).archive(form)
+    return find_sent_set(service, recordings_id).archive(form)
 
 
 @router.delete(
@@ -267,4 +267,4 @@ def recordings_archive(service: Here, recordings_id: HexId, form: Form) -> Respo
 )
 def delete_recordings(service: Here, recordings_id: HexId) -> None:
     """Delete a recording set for ever. Results and reports of it stay. 409 while a job works on it."""
-    sent_set(service, recordings_id).delete(service)
+    find_sent_set(service, recordings_id).delete(service)

@@ -12,8 +12,8 @@ from sse_starlette.event import ServerSentEvent
 from sse_starlette.sse import EventSourceResponse
 
 from api.archives import ARCHIVE, Form, Packed
-from api.errors import Conflict, answers, known
-from api.events import described, event, stream, watched
+from api.errors import Conflict, answers, find_or_404
+from api.events import describe_events, event, stream, watch_state
 from api.frames import FOR_EVER, Npy, Picture, Stretch, Width, npy_of, picture_of
 from api.kept_sets import session_set
 from api.keys import Permission, StoredKey
@@ -35,7 +35,7 @@ from api.schemas import (
 )
 from api.security import Demand
 from api.service import ADMIN, OPERATE, OVER, READ, ROOM, Here, RegistryId, Service, SessionId, missing_session
-from api.then import check_webhook, keep_request, kept_request, then_of
+from api.then import check_webhook, keep_request, read_request, then_of
 from lab.calibration.overview import SessionOverview, overviews, sessions_of_verdict, tags_of
 from lab.capture.by_hand import left_by_hand
 from lab.capture.plan import full_plan
@@ -96,7 +96,7 @@ def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
     return fields | {"error": service.public.or_none(error)}
 
 
-def _listed(service: Service, info: SessionInfo, by_session: dict[str, SessionOverview]) -> dict[str, Any]:
+def _list_entry(service: Service, info: SessionInfo, by_session: dict[str, SessionOverview]) -> dict[str, Any]:
     overview = by_session.get(info.id, SessionOverview())  # it was deleted meanwhile
     return _fields(service, info) | overview.model_dump() | {"tags": tags_of(info.notes)}
 
@@ -108,7 +108,7 @@ def check_then(service: Service, request: Request, start: SessionStart) -> None:
         check_webhook(start.then.webhook, service.then.hosts)
 
 
-def registered(service: Service, start: SessionStart, station: Station) -> str:
+def register_session(service: Service, start: SessionStart, station: Station) -> str:
     """Register a session that doesn't run yet; its id. Raises InputError where the station can't take it."""
     session = CaptureSession.start(
         service.store,
@@ -127,7 +127,7 @@ def session_request(service: Here, session_id: SessionId) -> SessionStart:
     """What a session was asked to start with, as `POST /sessions` takes it: to be copied, or edited while it waits. 404
     where it wasn't started by a service."""
     service.session(session_id)
-    kept = kept_request(service.store, session_id)
+    kept = read_request(service.store, session_id)
     if kept is None:
         raise HTTPException(404, f"session {session_id}: what it was asked with isn't kept; start one by hand")
     return kept
@@ -168,7 +168,7 @@ def list_sessions(
     total = service.store.count_sessions(search=search, only=only)
     page_headers(request, response, total, limit, [info.id for info in infos])
     by_session = overviews(service.store, [info.id for info in infos])
-    return [ListedSession(**_listed(service, info, by_session)) for info in infos]
+    return [ListedSession(**_list_entry(service, info, by_session)) for info in infos]
 
 
 @router.post(
@@ -185,7 +185,7 @@ def start_session(service: Here, request: Request, start: SessionStart, response
     check_then(service, request, start)
     station = service.station(start.station)
     if start.queue:
-        session_id = registered(service, start, station)
+        session_id = register_session(service, start, station)
         put_into_queue(service.store, session_id, start.not_before)
         service.waiting.look_soon()
     else:
@@ -199,10 +199,10 @@ def start_session(service: Here, request: Request, start: SessionStart, response
 @router.get("/sessions/{session_id}", tags=["sessions"], dependencies=[READ], responses=answers(401, 404, 422))
 def get_session(service: Here, session_id: SessionId) -> SessionDetail:
     """One session, with its provenance."""
-    details = known(missing_session(session_id), lambda: service.store.details(session_id))
+    details = find_or_404(missing_session(session_id), lambda: service.store.details(session_id))
     return SessionDetail(
-        **_listed(service, details.info, overviews(service.store, [session_id])),
-        can_copy=kept_request(service.store, session_id) is not None,
+        **_list_entry(service, details.info, overviews(service.store, [session_id])),
+        can_copy=read_request(service.store, session_id) is not None,
         then=then_of(service.store, session_id),
         progress=service.progress(session_id) if details.info.closed is None else None,
         asks=service.asks(session_id),
@@ -326,12 +326,14 @@ async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> A
     last_state = None
     live = service.live.find(session_id)
     if live is None:  # another process runs it, or nobody does
-        async for told in watched(look, lambda session: session.state in OVER, "state", stopping, service.changed):
-            yield told
+        async for progress_event in watch_state(
+            look, lambda session: session.state in OVER, "state", stopping, service.changed
+        ):
+            yield progress_event
         return
     yield event("state", await asyncio.to_thread(look))
     async for progress in live.follow(stopping):
-        text = live.once(progress, lambda state: service.told(state).model_dump_json())
+        text = live.once(progress, lambda state: service.make_public(state).model_dump_json())
         yield ServerSentEvent(event="progress", data=text)
         if (progress.state, live.pausing) != last_state:
             last_state = (progress.state, live.pausing)
@@ -346,7 +348,7 @@ async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> A
     dependencies=[READ],
     response_class=EventSourceResponse,
     responses=answers(401, 404, 422)
-    | described(
+    | describe_events(
         ("state", StoredSession, "at once, and whenever the state changes"),
         ("progress", Progress, "at once and at every step, while this service runs the session"),
         ("end", StoredSession, "when nothing more will come"),
@@ -359,18 +361,18 @@ def session_events(service: Here, session_id: SessionId) -> EventSourceResponse:
 
 
 def _capture(info: CaptureInfo) -> StoredCapture:
-    here = f"/api/v1/sessions/{info.session_id}/captures/{info.id}"
+    address = f"/api/v1/sessions/{info.session_id}/captures/{info.id}"
     return StoredCapture(
         **info.model_dump(),
         exposure_s=info.document.get("exposure_s"),
-        preview=f"{here}/preview.png",
-        frame=f"{here}/frame.npy",
+        preview=f"{address}/preview.png",
+        frame=f"{address}/frame.npy",
     )
 
 
 def _known_capture(service: Service, session_id: str, capture_id: int) -> CaptureInfo:
     missing = f"no capture {capture_id} in session {session_id[:60]!r}; GET /api/v1/sessions/ID/captures lists them"
-    info = known(missing, lambda: service.store.capture(capture_id))
+    info = find_or_404(missing, lambda: service.store.capture(capture_id))
     if info.session_id != session_id:
         raise HTTPException(404, missing)
     return info
@@ -395,7 +397,7 @@ def list_captures(
     limit: Limit = PAGE,
 ) -> list[StoredCapture]:
     """The captures of a session, in the order in which they were taken or the newest first, in pages."""
-    capture = known(
+    capture = find_or_404(
         missing_session(session_id),
         lambda: service.store.captures(
             session_id,

@@ -9,14 +9,14 @@ from fastapi import APIRouter, HTTPException, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import PlainTextResponse
 
-from api.errors import Conflict, answers, known
+from api.errors import Conflict, answers, find_or_404
 from api.routes.sessions import station_state
 from api.schemas import ConnectedDevice, DeviceCheck, DeviceState, PlanAsked, StationState
 from api.service import OPERATE, READ, Here, Service
 from drivers import discovery
 from drivers.errors import InstrumentError
 from lab.capture.by_hand import left_by_hand, note_put_back
-from lab.capture.catalogue import PlanEstimate, SequenceDescription, catalogue, described, estimate, step_times
+from lab.capture.catalogue import PlanEstimate, SequenceDescription, catalogue, describe_sequence, estimate, step_times
 from lab.capture.station import Station
 from lab.errors import DeviceError
 
@@ -113,7 +113,7 @@ def list_sequences() -> list[SequenceDescription]:
 def get_sequence(sequence: str) -> SequenceDescription:
     """One sequence."""
     missing = f"no sequence {sequence[:60]!r}; GET /api/v1/sequences lists them"
-    return known(missing, lambda: described(sequence))
+    return find_or_404(missing, lambda: describe_sequence(sequence))
 
 
 @router.post("/stations/{name}/estimate", dependencies=[READ], responses=answers(401, 404, 422))

@@ -18,7 +18,7 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse
 
 from api.errors import Conflict, answers
-from api.kept_sets import KeptSet, sent_set, session_set
+from api.kept_sets import KeptSet, find_sent_set, session_set
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers, page_of
 from api.schemas import PredictionStart, SetAsked, StoredPrediction
 from api.service import CALIBRATE, READ, ROOM, Here, HexId, Service, camera_model
@@ -28,7 +28,7 @@ from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
 from lab.formats.result_file import read_result
 from lab.twin.budget import BudgetResult, budget, parse_uses
-from lab.twin.changes import checked_changes
+from lab.twin.changes import validate_changes
 from lab.twin.predict import predict
 from lab.twin.score import TwinScore, score
 from lab.twin.sealed import SealedPrediction, open_seal, seal, seal_path
@@ -54,7 +54,7 @@ def _set(service: Service, asked: SetAsked) -> tuple[str, KeptSet]:
     if asked.session_id is not None:
         return asked.session_id, session_set(service, asked.session_id)
     assert asked.recordings_id is not None  # the schema wants one of both
-    return asked.recordings_id, sent_set(service, asked.recordings_id)
+    return asked.recordings_id, find_sent_set(service, asked.recordings_id)
 
 
 def _read(kept: KeptSet) -> RecordingSet:
@@ -99,7 +99,7 @@ def _fields(service: Service, prediction_id: str, prediction: SealedPrediction) 
 def make_prediction(service: Here, asked: PredictionStart, response: Response) -> StoredPrediction:
     """Predict the measured numbers of a session that hasn't been captured, with their covariance, and seal them, as
     `calibench twin predict` does. 422, in one line, for a change that the model can't carry."""
-    changes = checked_changes(asked.changes.model_dump(exclude_none=True), "changes.")
+    changes = validate_changes(asked.changes.model_dump(exclude_none=True), "changes.")
     models = camera_models.camera_files(service.store, camera_model(service, asked.camera_model))
     plan_id, plan = _set(service, asked.plan)
     fitted = None if asked.fitted is None else _read(_set(service, asked.fitted)[1])
@@ -189,7 +189,7 @@ def camera_model_budget(
     ] = None,
 ) -> dict[Side, BudgetResult]:
     """What matters for a use of each camera at the model's present uncertainty, as `calibench twin budget` tells it."""
-    uses = known_uses(use)
+    uses = parse_uses_or_422(use)
     there = None if station is None else service.station(station)
     times = None if there is None else step_times(service.store, there)
     models = camera_models.camera_files(service.store, camera_model(service, model_id))
@@ -197,7 +197,7 @@ def camera_model_budget(
         return {side: budget(content, uses, there, times) for side, content in models.items()}
 
 
-def known_uses(text: str) -> tuple[str, ...]:
+def parse_uses_or_422(text: str) -> tuple[str, ...]:
     """The uses of a request; 422 for one that isn't known."""
     try:
         return parse_uses(text)

@@ -244,7 +244,7 @@ class AravisCamera(GenicamCamera):
 
     @staticmethod
     def enumerate_cameras() -> Iterator[tuple[str, str]]:
-        """(address, what it is) of every camera that Aravis finds."""
+        """Yield (address, what it is) of every camera that Aravis finds."""
         library = _library()
         library.update_device_list()
         for index in range(library.get_n_devices()):

@@ -70,7 +70,7 @@ class Camera(Instrument):
 
     @abstractmethod
     def sensor(self) -> SensorInfo:
-        """Size, format and colour filters as the camera reports them."""
+        """Return size, format and colour filters as the camera reports them."""
 
     @abstractmethod
     def configure(self, exposure_s: float, gain_db: float = 0.0) -> None:
@@ -103,11 +103,12 @@ class Camera(Instrument):
         """
 
     def follow(self) -> None:
-        """Called right after the camera that leads was triggered: a camera that isn't wired to it is triggered by
-        software here."""
+        """Note that it is right after the camera that leads was triggered: a camera that isn't wired to it is triggered
+        by software here.
+        """
 
     def capture(self) -> Frame:
-        """One frame on a software trigger."""
+        """Return one frame on a software trigger."""
         self.arm("software")
         self.fire()
         return self.collect()
@@ -138,8 +139,8 @@ class StreamingCamera(Camera):
 
 
 def capture_together(cameras: Sequence[Camera]) -> tuple[Frame, ...]:
-    """One frame of each camera, exposed at the same time: the first is triggered by software and pulses the others'
-    line.
+    """Return one frame of each camera, exposed at the same time: the first is triggered by software and pulses the
+    others' line.
 
     Cameras that aren't wired follow milliseconds later (`follow`).
 

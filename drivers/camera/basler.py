@@ -81,7 +81,7 @@ class BaslerCamera(GenicamCamera):
 
     @staticmethod
     def enumerate_cameras() -> Iterator[tuple[str, str]]:
-        """(address, what it is) of every camera that pypylon finds."""
+        """Yield (address, what it is) of every camera that pypylon finds."""
         for info in pylon_library().TlFactory.GetInstance().EnumerateDevices():
             yield info.GetSerialNumber(), f"Basler {info.GetModelName()} {info.GetSerialNumber()}"
 

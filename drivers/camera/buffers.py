@@ -31,7 +31,7 @@ class Grabbed:
     camera_time_ns: int | None = None
     give_back: Callable[[], None] = lambda: None
 
-    def unpacked(self, who: str) -> tuple[NDArray[np.uint16], PixelFormat]:
+    def unpack(self, who: str) -> tuple[NDArray[np.uint16], PixelFormat]:
         """Return the codes, (rows, cols) DN, in memory of their own, and the pixel format.
 
         Raises `Garbled` for a frame that isn't whole, or whose pixel format isn't known.

@@ -50,7 +50,7 @@ class _Port(genapi.AbstractPort):  # type: ignore[misc]  # the package has no ty
     def close(self) -> None: ...
 
 
-def said(error: Exception) -> str:
+def library_message(error: Exception) -> str:
     """Return what the library says, without its numbers and the place in its sources."""
     text = str(error).removeprefix("GenTL exception: ").split(" : ")
     text = text[1:2] if text[0].startswith("Feature '") and len(text) > 1 else text[:1]
@@ -76,7 +76,7 @@ class GenApiFeatures:
             nodes.load_xml_from_string(xml.decode("utf-8", "replace"))
         except genapi.GenericException as error:
             raise InstrumentError(
-                f"{who}: the camera's XML can't be read: {said(error)}; its firmware may need an update"
+                f"{who}: the camera's XML can't be read: {library_message(error)}; its firmware may need an update"
             ) from error
         through = _Port(port)
         nodes.connect(through, "Device")
@@ -90,11 +90,11 @@ class GenApiFeatures:
             return action(self._nodes.get_node(name))
         except gentl.GenericException as error:
             raise Disconnected(
-                f"{self._who}: feature {name}: {said(error)}; plug it in again, the next call reconnects"
+                f"{self._who}: feature {name}: {library_message(error)}; plug it in again, the next call reconnects"
             ) from error
         except genapi.GenericException as error:
             raise InstrumentError(
-                f"{self._who}: feature {name}: {said(error)}; check that the camera is there and has it"
+                f"{self._who}: feature {name}: {library_message(error)}; check that the camera is there and has it"
             ) from error
         except (AttributeError, TypeError) as error:  # of an interface that has no such thing
             kind = type(self._nodes.get_node(name)).__name__.removeprefix("I")

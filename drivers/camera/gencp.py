@@ -81,7 +81,7 @@ class GenCp:
         self.max_command = self.max_ack = LEAST_PACKET
 
     def read(self, address: int, length: int) -> bytes:
-        """`length` bytes at `address`, in packets of the size that the camera allows."""
+        """Return `length` bytes at `address`, in packets of the size that the camera allows."""
         data = bytearray()
         most = max(4, self.max_ack - PREFIX.size)
         while len(data) < length:
@@ -106,7 +106,7 @@ class GenCp:
         return int.from_bytes(self.read(address, length), "little")
 
     def text(self, address: int) -> str:
-        """One of the standard's 64-byte texts."""
+        """Return one of the standard's 64-byte texts."""
         return self.read(address, TEXT_BYTES).split(b"\0", 1)[0].decode("utf-8", "replace")
 
     def _transact(self, command: int, body: bytes, expected: int) -> bytes:

@@ -331,7 +331,7 @@ class GenicamCamera(StreamingCamera):
                 if not grabbed.damage:
                     self._refuse_repeated(grabbed)
                 self._owed = max(0, self._owed - 1)
-                raw, pixel_format = grabbed.unpacked(self._who)
+                raw, pixel_format = grabbed.unpack(self._who)
             finally:
                 grabbed.give_back()
             return Frame(

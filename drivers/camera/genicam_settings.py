@@ -23,20 +23,20 @@ class Features(Protocol):
         """Return whether the camera has it, and it is available now."""
 
     def get(self, name: str) -> Setting:
-        """Its value; an enumeration's as the entry's name."""
+        """Return its value; an enumeration's as the entry's name."""
 
     def set(self, name: str, value: Setting) -> None:
         """Write it. Raises `InstrumentError`."""
 
     def entries(self, name: str) -> Collection[str]:
-        """Names of an enumeration's entries."""
+        """Return the names of an enumeration's entries."""
 
 
 class CameraFeatures(Features, Protocol):
     """A camera's features, with limits and commands."""
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Least and greatest value of a number."""
+        """Return least and greatest value of a number."""
 
     def execute(self, name: str) -> None:
         """Run a command."""
@@ -307,7 +307,7 @@ def _is_neutral(setting: Setting, neutral: Setting) -> bool:
 
 
 def snapshot(features: Features) -> dict[str, Setting]:
-    """All settings that bear on a frame, as the camera reports them; those that it can't tell now are left out."""
+    """Return all settings that bear on a frame, as the camera reports them, without those that it can't tell now."""
     settings: dict[str, Setting] = {}
     for name in (*RECORDED, "Gain"):
         _note(features, name, name, settings)

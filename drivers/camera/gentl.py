@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from drivers.camera.buffers import Grabbed
-from drivers.camera.genapi import GenApiFeatures, said
+from drivers.camera.genapi import GenApiFeatures, library_message
 from drivers.camera.genicam import GenicamCamera
 from drivers.errors import Disconnected, InstrumentError, InUse
 from drivers.instrument import Identity
@@ -95,8 +95,8 @@ class _Producer:
         with self._open() as open_cameras:
             return [
                 (
-                    _told(camera, "serial_number") or camera.id_,
-                    " ".join(filter(None, (_told(camera, name) for name in ("vendor", "model", "serial_number")))),
+                    _read_info(camera, "serial_number") or camera.id_,
+                    " ".join(filter(None, (_read_info(camera, name) for name in ("vendor", "model", "serial_number")))),
                 )
                 for camera in open_cameras
             ]
@@ -114,7 +114,7 @@ class _Producer:
             asked[key.REMOTE_DEVICE_SOURCE_XML_FILE_PATH] = description
         with self._open() as open_cameras:
             for camera in open_cameras:
-                if address in (_told(camera, name) for name in ("serial_number", "id_", "user_defined_name")):
+                if address in (_read_info(camera, name) for name in ("serial_number", "id_", "user_defined_name")):
                     acquirer = self._open_camera(camera, core.ParameterSet(asked))
                     self._taken += 1
                     return acquirer
@@ -191,7 +191,7 @@ class GentlCamera(GenicamCamera):
 
     @staticmethod
     def enumerate_cameras() -> Iterator[tuple[str, str]]:
-        """(address, what it is) of every camera that the installed producers find."""
+        """Yield (address, what it is) of every camera that the installed producers find."""
         _library()
         for producer in _producers(None):
             yield from producer.cameras()
@@ -227,9 +227,9 @@ class GentlCamera(GenicamCamera):
         versions = (name for name in ("DeviceFirmwareVersion", "DeviceVersion") if nodes.has(name))
         firmware = next((str(nodes.get(name)) for name in versions), "")
         return nodes, Identity(
-            _told(device, "vendor") or "",
-            _told(device, "model") or "",
-            _told(device, "serial_number") or device.id_,
+            _read_info(device, "vendor") or "",
+            _read_info(device, "model") or "",
+            _read_info(device, "serial_number") or device.id_,
             firmware,
         )
 
@@ -245,8 +245,8 @@ class GentlCamera(GenicamCamera):
             ) from error
         except (gentl.GenericException, genapi.GenericException) as error:
             raise Disconnected(
-                f"camera {self.address}: can't be opened ({said(error)}); plug it in again, and close other programs "
-                "that use it"
+                f"camera {self.address}: can't be opened ({library_message(error)}); plug it in again, and close "
+                "other programs that use it"
             ) from error
 
     def _start(self) -> None:
@@ -280,17 +280,17 @@ class GentlCamera(GenicamCamera):
         whole = buffer.payload_type in (kinds.PAYLOAD_TYPE_IMAGE, kinds.PAYLOAD_TYPE_CHUNK_DATA)
         return Grabbed(
             payload=np.frombuffer(
-                buffer.raw_buffer, np.uint8, offset=(_told(buffer, "image_offset") or 0) if whole else 0
+                buffer.raw_buffer, np.uint8, offset=(_read_info(buffer, "image_offset") or 0) if whole else 0
             ),
             rows=int(buffer.height) if whole else 0,
             cols=int(buffer.width) if whole else 0,
-            code=_told(buffer, "pixel_format") or self._format.code,
+            code=_read_info(buffer, "pixel_format") or self._format.code,
             frame_id=int(buffer.frame_id),
-            padding=_told(buffer, "padding_x") or 0,
+            padding=_read_info(buffer, "padding_x") or 0,
             damage=""
             if whole
             else f"it isn't one picture (payload type {buffer.payload_type}): switch other components off",
-            camera_time_ns=_told(buffer, "timestamp_ns"),
+            camera_time_ns=_read_info(buffer, "timestamp_ns"),
             give_back=lambda: self._do("queueing a buffer", lambda: buffer.parent.queue_buffer(buffer)),
         )
 
@@ -304,7 +304,7 @@ class GentlCamera(GenicamCamera):
             return action()
         except (gentl.GenericException, genapi.GenericException) as error:
             raise Disconnected(
-                f"{self._who}: {doing} failed ({said(error)}); plug it in again, the next call reconnects"
+                f"{self._who}: {doing} failed ({library_message(error)}); plug it in again, the next call reconnects"
             ) from error
 
     def _release(self) -> None:
@@ -313,7 +313,7 @@ class GentlCamera(GenicamCamera):
             self._producer.give_back(acquirer)
 
 
-def _told(of: Any, name: str) -> Any:
+def _read_info(of: Any, name: str) -> Any:
     """Return what a producer says of a camera or a buffer; None where it doesn't."""
     from genicam import gentl
 

@@ -85,7 +85,7 @@ class Library:
         raise Disconnected(f"gphoto2: no camera {address!r}; it finds {listed}: plug it in and switch it on")
 
     def identity(self) -> tuple[str, str, str, str]:
-        """Maker, model, serial number, firmware."""
+        """Return maker, model, serial number, firmware."""
         first = self._first
         return first("manufacturer"), first("cameramodel"), first("serialnumber"), first("deviceversion")
 
@@ -124,7 +124,7 @@ class Library:
         raise InstrumentError(f"gphoto2: {name} is no command")
 
     def settings(self) -> dict[str, Setting]:
-        """All settings, by name."""
+        """Return all settings, by name."""
         settings: dict[str, Setting] = {}
 
         def look(widget: Any) -> None:
@@ -145,7 +145,7 @@ class Library:
         self._camera.trigger_capture()
 
     def files(self) -> list[tuple[str, str]]:
-        """Folder and name of what the camera wrote since it was asked last."""
+        """Return folder and name of what the camera wrote since it was asked last."""
         library, files = self._library, []
         while True:
             kind, event = self._camera.wait_for_event(_EVENT_MS)

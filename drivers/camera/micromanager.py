@@ -61,7 +61,7 @@ class Core:
             raise InstrumentError(f"Micro-Manager: {configuration} has no camera; name it after `#` in the address")
 
     def identity(self) -> tuple[str, str, str, str]:
-        """Maker, model, serial number, firmware."""
+        """Return maker, model, serial number, firmware."""
         core = self._core
         return (
             core.getDeviceLibrary(self._camera),
@@ -74,7 +74,7 @@ class Core:
         return next((str(self.get(name)) for name in names if self.has(name)), "")
 
     def properties(self) -> dict[str, str]:
-        """All properties of the camera."""
+        """Return all properties of the camera."""
         return {name: str(self.get(name)) for name in self._core.getDevicePropertyNames(self._camera)}
 
     def temperature_c(self) -> float | None:
@@ -127,7 +127,7 @@ class Core:
         raise InstrumentError(f"Micro-Manager: {name} is no command; it has none")
 
     def size(self) -> tuple[int, int, int, int, int]:
-        """Rows, columns, bits of a code, bytes of a pixel, colours of a pixel."""
+        """Return rows, columns, bits of a code, bytes of a pixel, colours of a pixel."""
         core = self._core
         return (
             core.getImageHeight(),

@@ -23,12 +23,13 @@ class PixelFormat:
     packed: bool  # 12p, 10p: a stream of bits, least significant first; else 8 or 16 bits a pixel
 
     def payload_bytes(self, pixels: int) -> int:
-        """Bytes of that number of pixels."""
+        """Return the bytes of that number of pixels."""
         return (pixels * self.bits + 7) // 8 if self.packed else pixels * (1 if self.bits == 8 else 2)
 
     def unpack(self, payload: Payload, rows: int, cols: int, padding: int = 0) -> NDArray[np.uint16]:
-        """(rows, cols) uint16 of a payload whose rows are followed by `padding` bytes. Raises ValueError if it is
-        short."""
+        """Return (rows, cols) uint16 of a payload whose rows are followed by `padding` bytes. Raises ValueError if it
+        is short.
+        """
         line = self.payload_bytes(cols) + padding
         if padding == 0:
             flat = self._unpack_flat(np.frombuffer(payload, np.uint8), rows * cols)

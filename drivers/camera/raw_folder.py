@@ -172,7 +172,7 @@ class RawFolderCamera(Camera):
             return Frame(picture.raw, exposure_s, self._gain_db, None, self._fired, "raw file", self._frames - 1)
 
     def capture(self) -> Frame:
-        """One frame on a software trigger; of two threads the second waits."""
+        """Return one frame on a software trigger; of two threads the second waits."""
         with self._lock:
             return super().capture()
 

@@ -126,9 +126,9 @@ def _unplug(subject: _Subject) -> None:
     try:
         for _ in range(2):
             _fails_in_one_line(lambda: subject.contract.everyday(driver), "an unplugged instrument")
-        other = subject.make()
-        _fails_in_one_line(lambda: subject.contract.everyday(other), "a new driver of an unplugged instrument")
-        other.close()
+        second = subject.make()
+        _fails_in_one_line(lambda: subject.contract.everyday(second), "a new driver of an unplugged instrument")
+        second.close()
     finally:
         subject.peer.plug()
     _works_again(lambda: subject.contract.everyday(driver), "it was plugged in again")
@@ -192,12 +192,12 @@ def _two_at_once(subject: _Subject) -> None:
             thread.join(2 * LIMIT_S)
         require(not any(thread.is_alive() for thread in threads), "two threads wait for one another")
         require(not failures, f"two threads on one driver: {failures[0] if failures else ''}")
-        other = subject.make()
+        second = subject.make()
         try:
-            other.connect()
+            second.connect()
         except InstrumentError as error:
             require("\n" not in str(error), "the refusal of a second driver has several lines")
-        other.close()
+        second.close()
         _works_again(lambda: subject.contract.everyday(driver), "a second driver came and went")
 
 

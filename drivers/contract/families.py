@@ -26,13 +26,24 @@ class NotMet(Exception):
 
 
 def require(holds: bool, otherwise: str) -> None:
-    """Raise `NotMet` with `otherwise` unless something holds."""
+    """Raise `NotMet` with `otherwise` unless something holds.
+
+    >>> require(holds=True, otherwise="the shutter stays open")
+    """
     if not holds:
         raise NotMet(otherwise)
 
 
 def require_refused(call: Callable[[], object], what: str) -> None:
-    """Raise `NotMet` unless the call ends with an `InstrumentError` of one line."""
+    """Raise `NotMet` unless the call ends with an `InstrumentError` of one line.
+
+    call : that has to be refused
+    what : it asks for, in words
+
+    >>> def open_shutter():
+    ...     raise InstrumentError("lamp: no shutter; leave it out")
+    >>> require_refused(open_shutter, "a shutter")
+    """
     try:
         call()
     except InstrumentError as error:
@@ -48,15 +59,15 @@ class FamilyContract(ABC):
 
     @abstractmethod
     def everyday(self, driver: Any) -> None:
-        """A call that needs the instrument, and is right or raises `NotMet`."""
+        """Make a call that needs the instrument, and is right or raises `NotMet`."""
 
     @abstractmethod
     def takes_long(self, driver: Any) -> None:
-        """A call that takes seconds where the peer is slow."""
+        """Make a call that takes seconds where the peer is slow."""
 
     @abstractmethod
     def settings(self, driver: Any) -> None:
-        """What is within limits is done, what is beyond is refused."""
+        """Set what is within limits, and what is beyond, which has to be refused."""
 
     def is_safe(self, driver: Any) -> None:
         """Whether it is in its safe state; where that can't be asked, whether it works on."""

@@ -65,19 +65,19 @@ class RealInstrument(Peer):
         self.address, self.settings = address, settings
 
     def mute(self, silent: bool) -> None:
-        """Can't be done."""
+        """Do nothing: nobody silences or unplugs a real instrument."""
 
     def unplug(self) -> None:
-        """Can't be done."""
+        """Do nothing: nobody silences or unplugs a real instrument."""
 
     def plug(self) -> None:
-        """It is."""
+        """Do nothing: it is plugged in."""
 
     def slow(self, slowly: bool) -> bool:
         return False
 
     def close(self) -> None:
-        """It stays."""
+        """Do nothing: it stays there."""
 
 
 def peers() -> dict[str, EntryPoint]:

@@ -35,4 +35,4 @@ class Display(Instrument):
 
     @abstractmethod
     def screen_px(self) -> tuple[int, int]:
-        """Size (rows, cols) of the screen in its own pixels."""
+        """Return the size (rows, cols) of the screen in its own pixels."""

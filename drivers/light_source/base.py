@@ -21,7 +21,7 @@ class LightSource(Instrument):
 
     @abstractmethod
     def channels(self) -> tuple[str, ...]:
-        """Names of what can be dimmed apart; one at least."""
+        """Return the names of what can be dimmed apart; one at least."""
 
     @abstractmethod
     def set_level(self, level: float, channel: str | None = None) -> None:
@@ -141,7 +141,7 @@ class SteppedLamp(LightSource):
             kept.forget("step")
 
     def stop(self) -> None:
-        """Dark at once."""
+        """Darken it at once."""
         self._stopped.set()
         with self._lock, self._timed():
             self._stopped.clear()

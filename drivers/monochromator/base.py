@@ -39,10 +39,14 @@ ORDER_SORTING_FILTERS = (
 
 
 def order_sorting_filters(table: Sequence[object] | None) -> tuple[OrderSortingFilter, ...]:
-    """Return the filter table of a station file (rows of `place`, `from_nm`, `to_nm`), checked; None: the default
-    table.
+    """Return the filter table of a station file, checked; the default table where there is none.
+
+    table : rows of `place`, `from_nm`, `to_nm`
 
     Raises `InstrumentError` for a row that lacks a key, an empty or overlapping band.
+
+    >>> [row.place for row in order_sorting_filters([{"place": 1, "from_nm": 300, "to_nm": 600}])]
+    [1]
     """
     if table is None:
         return ORDER_SORTING_FILTERS
@@ -153,7 +157,7 @@ class Monochromator(Instrument):
 
     @abstractmethod
     def wavelength_nm(self) -> float:
-        """Wavelength (nm) that the instrument reports."""
+        """Return the wavelength (nm) that the instrument reports."""
 
     @abstractmethod
     def open_shutter(self) -> None:
@@ -173,11 +177,11 @@ class Monochromator(Instrument):
 
     @abstractmethod
     def selected_filter(self) -> int:
-        """Position of the filter wheel."""
+        """Return the position of the filter wheel."""
 
     @abstractmethod
     def slit_um(self) -> float:
-        """Width (um) of the entrance slit; the exit slit is kept at the same width."""
+        """Return the width (um) of the entrance slit; the exit slit is kept at the same width."""
 
     @abstractmethod
     def set_slit_um(self, width_um: float) -> None:
@@ -185,8 +189,8 @@ class Monochromator(Instrument):
 
     @abstractmethod
     def bandwidth_nm(self) -> float:
-        """Full width at half maximum (nm) of the light: slit width x reciprocal linear dispersion of the grating in
-        use.
+        """Return the full width at half maximum (nm) of the light: slit width x reciprocal linear dispersion of the
+        grating in use.
 
         0 where it isn't known, as the slits are set by hand and their width isn't stated; `departures` says so.
         """
@@ -196,14 +200,14 @@ class Monochromator(Instrument):
 SLIT_LIMITS_UM = (4.0, 3000.0)
 
 
-def checked_slit_um(width_um: float) -> float:
+def check_slit_um(width_um: float) -> float:
     """Check a slit width.
 
     width_um : um
 
     Returns it. Raises `InstrumentError` where the slits can't be set to it (a NaN included).
 
-    >>> checked_slit_um(500.0)
+    >>> check_slit_um(500.0)
     500.0
     """
     low, high = SLIT_LIMITS_UM
@@ -266,14 +270,14 @@ def lines_per_mm(text: str, who: str) -> float:
     return lines
 
 
-def checked_wavelength_nm(wavelength_nm: float, upper_nm: float) -> float:
+def check_wavelength_nm(wavelength_nm: float, upper_nm: float) -> float:
     """Check a wavelength.
 
     wavelength_nm, upper_nm : nm, and the highest that the grating reaches
 
     Returns it. Raises `InstrumentError` where the grating can't go there (a NaN included).
 
-    >>> checked_wavelength_nm(550.0, 1400.0)
+    >>> check_wavelength_nm(550.0, 1400.0)
     550.0
     """
     if not (math.isfinite(wavelength_nm) and 0.0 <= wavelength_nm <= upper_nm):

@@ -21,7 +21,7 @@ import time
 from drivers.errors import Garbled, InstrumentError, NoAnswer, Refused
 from drivers.found_settings import FoundSettings
 from drivers.instrument import Identity, Recorder, Setting
-from drivers.monochromator.base import HandSlits, Monochromator, checked_slit_um, checked_wavelength_nm
+from drivers.monochromator.base import HandSlits, Monochromator, check_slit_um, check_wavelength_nm
 from drivers.transport import Transport, WireInstrument, shown
 
 _ECHO, _GOTO, _UNITS, _QUERY, _END = 27, 16, 50, 56, 24
@@ -55,9 +55,9 @@ class Cm110(WireInstrument, Monochromator):
         recorder: Recorder | None = None,
     ) -> None:
         super().__init__(Transport(address, "CM110", baudrate=baudrate, timeout_s=timeout_s, recorder=recorder))
-        self.dark_nm = None if dark_nm is None else checked_wavelength_nm(dark_nm, upper_nm)
+        self.dark_nm = None if dark_nm is None else check_wavelength_nm(dark_nm, upper_nm)
         self.dispersion_nm_per_mm = dispersion_nm_per_mm
-        self._slits = HandSlits(None if slit_um is None else checked_slit_um(slit_um))
+        self._slits = HandSlits(None if slit_um is None else check_slit_um(slit_um))
         self.upper_nm = upper_nm
         self.tolerance_nm = tolerance_nm
         self.move_timeout_s = move_timeout_s
@@ -91,7 +91,7 @@ class Cm110(WireInstrument, Monochromator):
         )
 
     def check_nm(self, wavelength_nm: float) -> None:
-        wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
+        wanted = check_wavelength_nm(wavelength_nm, self.upper_nm)
         if self.dark_nm is not None and abs(wanted - self.dark_nm) <= self.tolerance_nm:
             raise InstrumentError(
                 f"monochromator: {wanted:g} nm is where it is parked in place of a shutter; ask for another "
@@ -99,7 +99,7 @@ class Cm110(WireInstrument, Monochromator):
             )
 
     def check_slit_um(self, width_um: float) -> None:
-        self._slits.set(checked_slit_um(width_um), self._transport.name)
+        self._slits.set(check_slit_um(width_um), self._transport.name)
 
     def move_nm(self, wavelength_nm: float) -> None:
         """Go there; or, while it is parked, keep the wavelength for when it is opened."""

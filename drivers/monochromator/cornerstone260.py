@@ -20,8 +20,8 @@ from drivers.monochromator.base import (
     NO_SLIT,
     HandSlits,
     Monochromator,
-    checked_slit_um,
-    checked_wavelength_nm,
+    check_slit_um,
+    check_wavelength_nm,
     filter_place,
     lines_per_mm,
     order_sorting_filters,
@@ -87,7 +87,7 @@ class Cornerstone260(WireInstrument, Monochromator):
         self.filters = order_sorting_filters(filters)
         self.grating = grating
         self.dispersion_nm_per_mm = dispersion_nm_per_mm
-        self._slits = HandSlits(None if slit_um is None else checked_slit_um(slit_um))
+        self._slits = HandSlits(None if slit_um is None else check_slit_um(slit_um))
         self._by_hand = slit_um is not None
         self.upper_nm = upper_nm
         self.tolerance_nm = tolerance_nm
@@ -105,10 +105,10 @@ class Cornerstone260(WireInstrument, Monochromator):
             return self._identity
 
     def check_nm(self, wavelength_nm: float) -> None:
-        filter_place(self.filters, checked_wavelength_nm(wavelength_nm, self.upper_nm))
+        filter_place(self.filters, check_wavelength_nm(wavelength_nm, self.upper_nm))
 
     def check_slit_um(self, width_um: float) -> None:
-        checked_slit_um(width_um)
+        check_slit_um(width_um)
         if self._by_hand:
             self._slits.set(width_um, self._transport.name)
 
@@ -133,7 +133,7 @@ class Cornerstone260(WireInstrument, Monochromator):
         return False
 
     def move_nm(self, wavelength_nm: float) -> None:
-        wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
+        wanted = check_wavelength_nm(wavelength_nm, self.upper_nm)
         with self._conversation():
             if self.filters:
                 self.select_filter(filter_place(self.filters, wanted))
@@ -193,7 +193,7 @@ class Cornerstone260(WireInstrument, Monochromator):
             return self._slits.stated_um
 
     def set_slit_um(self, width_um: float) -> None:
-        wanted = checked_slit_um(width_um)
+        wanted = check_slit_um(width_um)
         with self._conversation():
             if self._slit_um() is None or self._by_hand:
                 self._slits.set(wanted, self._transport.name)

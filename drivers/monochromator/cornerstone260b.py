@@ -22,8 +22,8 @@ from drivers.monochromator.base import (
     NO_SLIT,
     HandSlits,
     Monochromator,
-    checked_slit_um,
-    checked_wavelength_nm,
+    check_slit_um,
+    check_wavelength_nm,
     filter_place,
     lines_per_mm,
     order_sorting_filters,
@@ -63,7 +63,7 @@ class Cornerstone260B(Monochromator):
         self.filters = order_sorting_filters(filters)
         self.grating = grating
         self.dispersion_nm_per_mm, self.upper_nm, self.tolerance_nm = dispersion_nm_per_mm, upper_nm, tolerance_nm
-        self._slits = HandSlits(None if slit_um is None else checked_slit_um(slit_um))
+        self._slits = HandSlits(None if slit_um is None else check_slit_um(slit_um))
         self._by_hand = slit_um is not None
         self.timeout_s, self.move_timeout_s = timeout_s, move_timeout_s
         self._recorder = recorder
@@ -87,10 +87,10 @@ class Cornerstone260B(Monochromator):
             return self._identity
 
     def check_nm(self, wavelength_nm: float) -> None:
-        filter_place(self.filters, checked_wavelength_nm(wavelength_nm, self.upper_nm))
+        filter_place(self.filters, check_wavelength_nm(wavelength_nm, self.upper_nm))
 
     def check_slit_um(self, width_um: float) -> None:
-        checked_slit_um(width_um)
+        check_slit_um(width_um)
         if self._by_hand:
             self._slits.set(width_um, self._who)
 
@@ -99,7 +99,7 @@ class Cornerstone260B(Monochromator):
         return self._slits.departures(self._who) if self._by_hand else ()
 
     def move_nm(self, wavelength_nm: float) -> None:
-        wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
+        wanted = check_wavelength_nm(wavelength_nm, self.upper_nm)
         with self._conversation() as wire:
             if self.filters:
                 self.select_filter(filter_place(self.filters, wanted))
@@ -160,7 +160,7 @@ class Cornerstone260B(Monochromator):
             return self._slits.stated_um
 
     def set_slit_um(self, width_um: float) -> None:
-        wanted = checked_slit_um(width_um)
+        wanted = check_slit_um(width_um)
         with self._conversation():
             if self._slit_um() is None or self._by_hand:
                 self._slits.set(wanted, self._who)

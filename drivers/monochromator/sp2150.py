@@ -19,8 +19,8 @@ from drivers.instrument import Identity, Recorder, Setting
 from drivers.monochromator.base import (
     HandSlits,
     Monochromator,
-    checked_slit_um,
-    checked_wavelength_nm,
+    check_slit_um,
+    check_wavelength_nm,
     filter_place,
     order_sorting_filters,
 )
@@ -65,7 +65,7 @@ class Sp2150(WireInstrument, Monochromator):
                 f"monochromator: dark_place {dark_place} is an order-sorting filter's place, too; correct one of them"
             )
         self.dispersion_nm_per_mm = dispersion_nm_per_mm
-        self._slits = HandSlits(None if slit_um is None else checked_slit_um(slit_um))
+        self._slits = HandSlits(None if slit_um is None else check_slit_um(slit_um))
         self.upper_nm = upper_nm
         self.tolerance_nm = tolerance_nm
         self.move_timeout_s = move_timeout_s
@@ -84,13 +84,13 @@ class Sp2150(WireInstrument, Monochromator):
         return self._slits.departures(self._transport.name)
 
     def check_nm(self, wavelength_nm: float) -> None:
-        filter_place(self.filters, checked_wavelength_nm(wavelength_nm, self.upper_nm))
+        filter_place(self.filters, check_wavelength_nm(wavelength_nm, self.upper_nm))
 
     def check_slit_um(self, width_um: float) -> None:
-        self._slits.set(checked_slit_um(width_um), self._transport.name)
+        self._slits.set(check_slit_um(width_um), self._transport.name)
 
     def move_nm(self, wavelength_nm: float) -> None:
-        wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
+        wanted = check_wavelength_nm(wavelength_nm, self.upper_nm)
         place = filter_place(self.filters, wanted)
         with self._conversation():
             if self.selected_filter() != self.dark_place:  # else the blank stays until light may get out

@@ -30,7 +30,7 @@ class Photodiode(Instrument):
 
     @abstractmethod
     def measure_dark(self) -> float:
-        """Current (A) without light, mean of the readings; later measurements are above it."""
+        """Return the current (A) without light, mean of the readings; later measurements are above it."""
 
     def check_nm(self, wavelength_nm: float) -> None:
         """Raise `InstrumentError` for a wavelength (nm) that `measure` would refuse, as far as the driver knows;
@@ -39,5 +39,6 @@ class Photodiode(Instrument):
 
     @abstractmethod
     def measure(self, wavelength_nm: float) -> IrradianceMeasurement:
-        """Irradiance of light of this wavelength. Raises `InstrumentError` outside the calibration, `Refused` for an
-        overload."""
+        """Return the irradiance of light of this wavelength. Raises `InstrumentError` outside the calibration,
+        `Refused` for an overload.
+        """

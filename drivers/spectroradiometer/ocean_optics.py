@@ -145,8 +145,9 @@ class OceanOptics(Spectroradiometer):
             return Identity("Ocean Optics", self._model.replace("PLUS", "+"), serial_number)
 
     def measure(self) -> RadianceMeasurement:
-        """Spectral radiance: scans at an integration time of its own choice, dark pixels subtracted, corrected for
-        nonlinearity, divided by the response."""
+        """Return the spectral radiance: scans at an integration time of its own choice, dark pixels subtracted,
+        corrected for nonlinearity, divided by the response.
+        """
         with self._lock:
             self._stopped.clear()
             pixels = self._connect_once().f.spectrometer

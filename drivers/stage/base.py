@@ -23,7 +23,7 @@ class Stage(Instrument):
 
     @abstractmethod
     def targets(self) -> tuple[str, ...]:
-        """Names of the available targets; empty if the stage doesn't report them."""
+        """Return the names of the available targets; empty if the stage doesn't report them."""
 
     def instruct(self, instructions: Mapping[str, str]) -> None:
         """Tell what an operator does for each target. A stage that moves by itself needs no instruction."""

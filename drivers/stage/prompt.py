@@ -70,7 +70,7 @@ class PromptStage(Stage):
         self._placed = target
 
     def instruct(self, instructions: Mapping[str, str]) -> None:
-        """Instructions for targets that have none yet: those of the station file come first."""
+        """Take instructions for targets that have none yet: those of the station file come first."""
         self._instructions = {**instructions, **self._instructions}
 
     def ask_by(self, ask: Callable[[str, str], None]) -> None:
@@ -84,7 +84,7 @@ class PromptStage(Stage):
         return ()
 
     def stop(self) -> None:
-        """Nothing moves."""
+        """Do nothing: nothing moves."""
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: nothing is held."""

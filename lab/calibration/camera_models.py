@@ -148,7 +148,7 @@ def _select_models() -> Any:
 
 
 def records(store: Store, after: str | None = None, limit: int | None = None) -> list[CameraModelRecord]:
-    """Camera models, the newest first: `limit` at most, those that follow `after` in this order."""
+    """Return camera models, the newest first: `limit` at most, those that follow `after` in this order."""
     asked = _select_models().order_by(ResultRow.created.desc(), ResultRow.id.desc()).limit(limit)
     with store.reading() as db:
         if after is not None:
@@ -167,7 +167,7 @@ def count(store: Store) -> int:
 
 
 def record(store: Store, result_id: str) -> CameraModelRecord:
-    """One. Raises InputError where there is none."""
+    """Return a camera model. Raises InputError where there is none."""
     with store.reading() as db:
         row = db.execute(_select_models().where(ResultRow.id == result_id)).first()
     if row is None:

@@ -27,7 +27,7 @@ from lab.calibration.limits import (
     Limit,
     Mark,
     figures_of,
-    judged,
+    judge_figures,
 )
 from lab.capture.records import RunRecord, now
 from lab.capture.station import Station
@@ -165,7 +165,11 @@ def cameras_of(instruments: Snapshots, station: Station) -> dict[Side, str]:
 
 
 def rig_of(cameras: Mapping[Side, str]) -> str:
-    """Return the rig of these cameras: a calibration of it supersedes an earlier one of the same."""
+    """Return the rig of cameras by side: a calibration of it supersedes an earlier one of the same.
+
+    >>> rig_of({"right": "cam-2", "left": "cam-1"})
+    '{"left": "cam-1", "right": "cam-2"}'
+    """
     return json.dumps(dict(sorted(cameras.items())))
 
 
@@ -189,15 +193,15 @@ def check_certified(store: Store, instruments: Snapshots, station: Station) -> N
         if expired and expired[0].expires
         else f"{len(history)} calibrations of it are known, none is certified"
     )
-    for other in [
+    for certified in [
         calibration
         for calibration in others
         if calibration.state == "certified" and calibration.cameras.keys() == cameras.keys()
     ][:1]:
         changed = [
-            f"{side} was {was}, is {cameras[side]}" for side, was in other.cameras.items() if was != cameras[side]
+            f"{side} was {was}, is {cameras[side]}" for side, was in certified.cameras.items() if was != cameras[side]
         ]
-        why += f" (the newest certified one, {other.id}, is of other cameras: {'; '.join(changed)})"
+        why += f" (the newest certified one, {certified.id}, is of other cameras: {'; '.join(changed)})"
     raise InputError(
         f"cameras {', '.join(cameras.values())}: the session demands a certified calibration, and {why}; certify one "
         "with "
@@ -339,7 +343,11 @@ def _select_rows() -> Any:
 
 
 def calibrations(store: Store, after: str | None = None, limit: int | None = None) -> list[CalibrationRecord]:
-    """Calibrations, the newest first: `limit` at most, those that follow the calibration `after` in this order."""
+    """Return calibrations, the newest first.
+
+    after : id of the calibration that they follow in this order
+    limit : how many at most
+    """
     register(store)
     asked = _select_rows().order_by(CalibrationRow.created.desc(), CalibrationRow.id.desc()).limit(limit)
     with store.reading() as db:
@@ -359,7 +367,9 @@ def count_calibrations(store: Store) -> int:
 
 
 def calibration(store: Store, id: str) -> CalibrationRecord:
-    """One calibration, by its own id or by its session's: the newest of that. Raises InputError where there is none."""
+    """Return a calibration, by its own id or by its session's: the newest of that. Raises InputError where there is
+    none.
+    """
     register(store)
     wanted = _select_rows().where(sa.or_(CalibrationRow.id == id, CalibrationRow.session_id == id))
     with store.reading() as db:
@@ -389,7 +399,7 @@ def figures(store: Store, calibration_id: str) -> tuple[Figure, ...]:
 
 
 def figure_names(store: Store) -> list[tuple[str, str, str]]:
-    """(camera, figure, place) of every history."""
+    """Return (camera, figure, place) of every history."""
     register(store)
     asked = sa.select(FigureRow.camera, FigureRow.name, FigureRow.place).where(_FITTED).distinct()
     with store.reading() as db:
@@ -410,11 +420,11 @@ def certify(
         raise InputError(
             f"calibration {wanted.id}: is {wanted.state}, only a candidate can be certified; fit the session again"
         )
-    judgements = judged(figures(store, wanted.id), limits)
+    judgements = judge_figures(figures(store, wanted.id), limits)
     refused = ("bad", "missing") if accept_warnings else ("warn", "bad", "missing")
     if lines := [_refusal(wanted.id, judgement) for judgement in judgements if judgement.mark in refused]:
         raise InputError("\n".join(lines))
-    drafts, whence = drafted_limits(store, wanted.id)
+    drafts, whence = draft_limits(store, wanted.id)
     bands = {(draft.figure, draft.side, draft.place, draft.good) for draft in drafts}
     is_drafted = any((limit.figure, limit.side, limit.place, limit.good) in bands for limit in limits.limit)
     limits = limits.model_copy(update={"drafted_from": whence if is_drafted else ()})
@@ -594,7 +604,7 @@ def drift_board(
     newest: int = BOARD_COLUMNS,
     false_alarm_rate: float = FALSE_ALARM_RATE,
 ) -> DriftBoard:
-    """All figures of a camera by its `newest` calibrations, one of each session, and the one that is certified.
+    """Return all figures of a camera by its `newest` calibrations, one of each session, and the one that is certified.
 
     A cell is judged and compared as in `history`. Dark currents are shown at `reference_c` (deg C), by default the
     median of the temperatures at which they were measured; a limit judges them as they were measured. Raises InputError
@@ -732,9 +742,9 @@ DRAFTED_FROM, DRAFTED_LEAST = 30, 3
 DRAFTED_COVERAGE = 1.0 - FALSE_ALARM_RATE
 
 
-def drafted_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], tuple[str, ...]]:
-    """Limits drafted from what the cameras of a calibration had before it, and the ids of the calibrations that they
-    were drafted from, the newest last.
+def draft_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], tuple[str, ...]]:
+    """Return limits drafted from what the cameras of a calibration had before it, and the ids of the calibrations that
+    they were drafted from, the newest last.
 
     The ends are those of a prediction interval for the next calibration of an unchanged camera (Student's t, Hahn and
     Meeker 1991, section 4.8): mean +- t sqrt(s^2 (1 + 1/n)) with s at least the root mean square of the stated standard

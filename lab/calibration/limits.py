@@ -62,7 +62,14 @@ class Figure(Frozen):
 
 
 def figures_of(fit: FitResult) -> tuple[Figure, ...]:
-    """All figures of a fit, each once."""
+    """Return all figures of a fit with a standard deviation, each once.
+
+    >>> from lab.formats.results import CameraFit, FitResult, NoiseFit
+    >>> noise = NoiseFit(read_noise_e=2.0, read_noise_e_std=0.1)
+    >>> fit = FitResult(source="my-camera", cameras={"left": CameraFit(noise=noise)})
+    >>> [(figure.name, figure.value) for figure in figures_of(fit)]
+    [('noise read_noise_e', 2.0)]
+    """
     figures: list[Figure] = []
     models = [(side, camera, "") for side, camera in fit.cameras.items()]
     parts = [*models, (None, fit.stereo, "stereo ")] if fit.stereo is not None else models
@@ -124,7 +131,13 @@ class Limit(Frozen):
         return f"<= {high:g}" if low is None else f">= {low:g}" if high is None else f"{low:g} .. {high:g}"
 
     def judge(self, figure: Figure) -> Mark:
-        """In which band the figure lies, with its uncertainty."""
+        """Return in which band the figure lies, the whole interval of two standard deviations on each side (ISO
+        14253-1).
+
+        >>> limit = Limit(figure="noise read_noise_e", good=(None, 3.0), warn=(None, 4.0))
+        >>> limit.judge(Figure(name="noise read_noise_e", side="left", place="", value=2.9, std=0.1))
+        'warn'
+        """
         half = COVERAGE_FACTOR * figure.std
         for mark, band in (("good", self.good), ("warn", self.warn or self.good)):
             low, high = _ends(band)
@@ -174,8 +187,20 @@ class Judgement(Frozen):
     mark: Mark
 
 
-def judged(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judgement, ...]:
-    """Every figure that a limit concerns, in the order of the limits."""
+def judge_figures(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judgement, ...]:
+    """Judge every figure that a limit concerns, in the order of the limits.
+
+    figures : of a calibration, as `figures_of` lists them
+    limits : of the laboratory
+
+    Returns a judgement for each pair of limit and figure. A limit that concerns no figure has one of its own,
+    `missing`.
+
+    >>> limits = CalibrationLimits(limit=(Limit(figure="noise read_noise_e", good=(None, 3.0)),))
+    >>> figure = Figure(name="noise read_noise_e", side="left", place="", value=2.0, std=0.1)
+    >>> [judgement.mark for judgement in judge_figures((figure,), limits)]
+    ['good']
+    """
     judgements: list[Judgement] = []
     for limit in limits.limit:
         concerned = [figure for figure in figures if limit.concerns(figure)]
@@ -218,7 +243,15 @@ def standing_limits(folder: Path) -> CalibrationLimits | None:
 
 
 def read_limits(file: Path) -> CalibrationLimits:
-    """Return the limits of a TOML file. Raises InputError, one line for each problem."""
+    r"""Return the limits of a TOML file. Raises InputError, one line for each problem.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "limits.toml"
+    ...     _ = file.write_text('[[limit]]\nfigure = "noise read_noise_e"\ngood = [0.0, 3.0]\n')
+    ...     read_limits(file).limit[0].good_text
+    '0 .. 3'
+    """
     table = read_toml(file, "give a file of limits")
     try:
         return CalibrationLimits.model_validate(table)

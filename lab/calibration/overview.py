@@ -39,13 +39,17 @@ class SessionOverview(Frozen):
 
 
 def tags_of(notes: str) -> tuple[str, ...]:
-    """Return the tags of a session: the words of its notes that begin with #, each once."""
+    """Return the tags of a session: the words of its notes that begin with #, each once, without it.
+
+    >>> tags_of("new lens #wide, again #wide #cold")
+    ('wide', 'cold')
+    """
     return tuple(dict.fromkeys(_TAG.findall(notes)))
 
 
 @functools.lru_cache(maxsize=20_000)
 def verdict_of(store: Store, diagnosis: str) -> DiagnosisVerdict:
-    """Of a kept diagnosis, which never changes, and is long."""
+    """Return the verdict of a kept diagnosis, which never changes, and is long."""
     with store.reading() as db:
         verdict = db.scalars(
             sa.select(ResultRow.document["verdict"].as_string()).where(ResultRow.id == diagnosis)
@@ -63,12 +67,12 @@ def _diagnoses(store: Store, sessions: Sequence[str] | None) -> dict[str, Diagno
 
 
 def sessions_of_verdict(store: Store, verdict: DiagnosisVerdict) -> list[str]:
-    """Ids of the sessions (and folders of recordings) whose newest diagnosis said this."""
+    """Return the ids of the sessions (and folders of recordings) whose newest diagnosis said this."""
     return [source for source, its_verdict in _diagnoses(store, None).items() if its_verdict == verdict]
 
 
 def overviews(store: Store, sessions: Sequence[str]) -> dict[str, SessionOverview]:
-    """Session -> what is told of it in a list."""
+    """Return what a list shows of each session, by id."""
     register(store)
     of_sessions = sa.select(SessionRow.id, SessionRow.station["name"].as_string(), SessionRow.runs)
     fits = sa.select(CalibrationRow.session_id, CalibrationRow.id, CalibrationRow.cameras)

@@ -232,7 +232,7 @@ class _Writer:
         before = generations_of(self.target)
         for left in self.target.glob(".removed-*"):
             remove_tree(left)
-        linked, files = self._taken(before)
+        linked, files = self._write_registry_and_files(before)
         made = self._partial / RECORD
         if before and (newest := _record_or_none(before[0])) is not None:
             if newest.sessions and not linked.sessions:
@@ -294,7 +294,7 @@ class _Writer:
 
     # --- registry and files, until they agree -----------------------------------------------------------------------
 
-    def _taken(self, before: list[Generation]) -> tuple[_LinkedFiles, dict[str, FileSum]]:
+    def _write_registry_and_files(self, before: list[Generation]) -> tuple[_LinkedFiles, dict[str, FileSum]]:
         """Write registry and files into the partial generation, again while a session is packed or deleted."""
         damaged_before: dict[str, str] | None = None
         for _ in range(TRIES):
@@ -416,7 +416,9 @@ class _Writer:
                 continue
             name = "/".join(parts[:2])
             gone[name] = gone.get(name, 0) + 1
-        lines = [f"{name}: {_counted(number)} no longer in the data folder" for name, number in sorted(gone.items())]
+        lines = [
+            f"{name}: {_count_in_words(number)} no longer in the data folder" for name, number in sorted(gone.items())
+        ]
         if len(lines) > _NAMED:
             lines = [*lines[:_NAMED], f"and {len(lines) - _NAMED} more"]
         return tuple(f"{line}; the generation {before[0].name} has what it was, if nobody deleted it" for line in lines)
@@ -452,7 +454,7 @@ def _name_after(before: list[Generation]) -> str:
     return at.strftime(_NAME)
 
 
-def _counted(number: int) -> str:
+def _count_in_words(number: int) -> str:
     return "is" if number == 1 else f"{number} files are"
 
 
@@ -467,8 +469,8 @@ def _record_or_none(generation: Generation) -> GenerationRecord | None:
     return None
 
 
-def _same_size_and_time(file: Path, other: Path) -> bool:
-    a, b = file.lstat(), other.lstat()
+def _same_size_and_time(file: Path, second: Path) -> bool:
+    a, b = file.lstat(), second.lstat()
     return (a.st_size, a.st_mtime_ns) == (b.st_size, b.st_mtime_ns)
 
 

@@ -122,8 +122,8 @@ def left_by_hand(root: Path, station: Station | None = None) -> tuple[LeftByHand
     """Return what sessions left changed by hand, in the order of the sessions: on the instruments of `station`, or on
     all."""
     every = map(_read, sorted((root / FOLDER).glob("*.json")))
-    there = (one for one in every if one is not None)  # None: put back meanwhile
-    return tuple(one for one in there if station is None or station.addresses.intersection(one.addresses))
+    there = (session for session in every if session is not None)  # None: put back meanwhile
+    return tuple(session for session in there if station is None or station.addresses.intersection(session.addresses))
 
 
 def _read(file: Path) -> LeftByHand | None:

@@ -74,18 +74,26 @@ class PlanEstimate(Frozen):
 
 
 def catalogue() -> tuple[SequenceDescription, ...]:
-    """All sequences, in the order of a full session."""
-    return tuple(map(_described, SEQUENCES.values()))
+    """Return the descriptions of all sequences, in the order of a full session.
+
+    >>> "dark" in [sequence.name for sequence in catalogue()]
+    True
+    """
+    return tuple(map(_describe, SEQUENCES.values()))
 
 
-def described(name: str) -> SequenceDescription:
-    """One sequence. Raises InputError for an unknown name."""
+def describe_sequence(name: str) -> SequenceDescription:
+    """Return the description of a sequence. Raises InputError for an unknown name.
+
+    >>> describe_sequence("dark").capture_kinds
+    ('dark',)
+    """
     if name not in SEQUENCES:
         raise InputError(f"no sequence {name[:60]!r}; there are {', '.join(SEQUENCES)}")
-    return _described(SEQUENCES[name])
+    return _describe(SEQUENCES[name])
 
 
-def _described(kind: type[Sequence]) -> SequenceDescription:
+def _describe(kind: type[Sequence]) -> SequenceDescription:
     return SequenceDescription(
         name=kind.name,
         purpose=kind.purpose,
@@ -107,14 +115,22 @@ def _described(kind: type[Sequence]) -> SequenceDescription:
 
 
 def parse_parameters(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Parameters from texts like `narrowband.step_nm=5` or `dark.exposures_s=0.01,0.1,1`. Raises InputError."""
+    """Return parameters of sequences, by sequence and name.
+
+    texts : `SEQUENCE.PARAMETER=VALUE`, several values with commas
+
+    Raises InputError for a sequence that there isn't, and for a value that is no number.
+
+    >>> parse_parameters(["narrowband.step_nm=5"])
+    {'narrowband': {'step_nm': 5.0}}
+    """
     parameters: dict[str, dict[str, Any]] = defaultdict(dict)
     for text in texts:
         name, _, value = text.partition("=")
         sequence, _, parameter = name.strip().partition(".")
         if sequence not in SEQUENCES or not parameter or not value:
             raise InputError(f"{text!r}: give SEQUENCE.PARAMETER=VALUE, of a sequence of {', '.join(SEQUENCES)}")
-        several = {parameter.name for parameter in described(sequence).parameters if parameter.several}
+        several = {parameter.name for parameter in describe_sequence(sequence).parameters if parameter.several}
         try:
             numbers = [float(part) for part in value.split(",")]
         except ValueError:
@@ -152,8 +168,8 @@ class StepTimes:
     per_exposure: float = 1.0
 
     @classmethod
-    def learned(cls, seen: Iterable[tuple[Step, float]]) -> StepTimes:
-        """From steps and how long (s) each took."""
+    def learn(cls, seen: Iterable[tuple[Step, float]]) -> StepTimes:
+        """Return the times that steps and how long (s) each took show."""
         taken = [(_work(step), _exposure_s(step), seconds) for step, seconds in seen]
         per_exposure = 1.0
         if len({exposure for _, exposure, _ in taken if exposure > 0}) > 1:
@@ -185,7 +201,7 @@ def step_times(store: Store, station: Station) -> StepTimes:
             StepRow.session_id.in_(same), StepRow.started.is_not(None), StepRow.finished.is_not(None)
         )
         rows = db.execute(steps).all()
-    return StepTimes.learned(
+    return StepTimes.learn(
         (Step.model_validate(spec), (finished - started).total_seconds()) for spec, started, finished in rows
     )
 
@@ -201,7 +217,7 @@ def _instruments(station: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
 
 
 def estimate(plan: CapturePlan, station: Station, times: StepTimes) -> PlanEstimate:
-    """Captures and time of a plan. Raises InputError where the station lacks what it needs."""
+    """Return captures and time of a plan. Raises InputError where the station lacks what it needs."""
     plan.steps(station)  # refuses what can't be taken as a whole
     planned = []
     for sequence in plan.sequences:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def open_store(folder: Path | None = None) -> Store:
-    """The data folder: `folder`, else what CALIBENCH_DATA says; made if it isn't there."""
+    """Open the data folder: `folder`, else what CALIBENCH_DATA says; made if it isn't there."""
     from lab.capture.settings import Settings
     from lab.capture.store import Store
 
@@ -21,7 +21,7 @@ def open_store(folder: Path | None = None) -> Store:
 
 
 def existing_store(folder: Path | None = None) -> Store | None:
-    """The store of the data folder, as `open_store` finds it; None where there is none. Reading never makes one."""
+    """Return the store of the data folder, as `open_store` finds it; None without one: reading makes none."""
     from lab.capture.settings import Settings
 
     settings = Settings() if folder is None else Settings(data=folder)
@@ -30,8 +30,9 @@ def existing_store(folder: Path | None = None) -> Store | None:
 
 
 def store_to_read(folder: Path | None = None) -> Store:
-    """The store of the data folder, for a command that only reads or changes what is there. Raises InputError where
-    there is none."""
+    """Return the store of the data folder, for a command that only reads or changes what is there. Raises InputError
+    where there is none.
+    """
     from lab.capture.settings import Settings
 
     store = existing_store(folder)

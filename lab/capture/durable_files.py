@@ -12,15 +12,30 @@ from numpy.typing import NDArray
 
 
 def npy_bytes(array: NDArray[Any]) -> bytes:
-    """Return an array as the bytes of its .npy file."""
+    """Return an array as the bytes of its .npy file.
+
+    >>> npy_bytes(np.zeros((2, 2), np.uint16))[1:6]
+    b'NUMPY'
+    """
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()
 
 
 def write_durably(path: Path, content: bytes) -> None:
-    """Write a file completely or not at all, and flush it to the disk: temporary name, fsync, rename, fsync of the
-    folder."""
+    """Write a file completely or not at all, and flush it to the disk.
+
+    path : to be written
+    content : its bytes
+
+    It gets a temporary name, fsync, its own name, and an fsync of the folder. Raises OSError.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     write_durably(Path(folder) / "frame.npy", npy_bytes(np.zeros((2, 2), np.uint16)))
+    ...     np.load(Path(folder) / "frame.npy").tolist()
+    [[0, 0], [0, 0]]
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
     try:

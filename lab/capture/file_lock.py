@@ -18,8 +18,9 @@ class Lock:
         self._file: int | None = None
 
     def acquire(self, patience_s: float = 0.2) -> bool:
-        """Try to take the lock for `patience_s`; whether it succeeded. It has to try, as `is_held` holds the lock for a
-        moment."""
+        """Take the lock, trying for `patience_s`; return whether it succeeded. It has to try, as `is_held` holds the
+        lock for a moment.
+        """
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)

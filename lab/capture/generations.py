@@ -112,7 +112,15 @@ def lock_of(backup: Path) -> Lock:
 
 
 def sha256_of(file: Path) -> str:
-    """Return a file's SHA-256."""
+    """Return a file's SHA-256, in hexadecimal digits.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "empty"
+    ...     file.touch()
+    ...     sha256_of(file)[:8]
+    'e3b0c442'
+    """
     with file.open("rb") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()
 
@@ -168,7 +176,18 @@ def sync_folder(folder: Path) -> None:
 
 
 def can_be_parsed(file: Path, name: Path) -> bool:
-    """Return whether a file with a name of .toml or .json is one; true for other files."""
+    """Return whether a file with a name of .toml or .json is one; true for other files.
+
+    file : whose content is read
+    name : that it has in the data folder
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "copy"
+    ...     _ = file.write_text("valid_days = ")
+    ...     can_be_parsed(file, Path("limits.toml"))
+    False
+    """
     parse = {".toml": tomllib.loads, ".json": json.loads}.get(name.suffix)
     try:
         if parse is not None:
@@ -198,9 +217,9 @@ def remove_tree(folder: Path) -> None:
 
 @contextlib.contextmanager
 def acting_as_owner(owned: Path, made: Path | None = None) -> Iterator[None]:
-    """Within it, root acts as the user to whom the folder `owned` belongs, so that what is written belongs to that
-    user, and a link of that user leads nowhere that the user may not go. Other users, and root with folders of its own,
-    act as themselves.
+    """Let root act, within the block, as the user to whom the folder `owned` belongs, so that what is written belongs
+    to that user, and a link of that user leads nowhere that the user may not go. Other users, and root with folders of
+    its own, act as themselves.
 
     `made`: a folder that root makes for that user before. Raises InputError where it belongs to another user.
     """

@@ -31,8 +31,9 @@ class CapturePlan:
         return tuple(sequence.name for sequence in self.sequences)
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
-        """All steps. What a hand puts back only to change it again at once stays as it is. Raises InputError if the
-        station lacks what one of them needs, and where a step is there twice."""
+        """Return all steps. What a hand puts back only to change it again at once stays as it is. Raises InputError if
+        the station lacks what one of them needs, and where a step is there twice.
+        """
         every = [step for sequence in self.sequences for step in sequence.steps(station)]
         kinds = {name: type(target) for name, target in station.list_targets(Adjustment).items()}
         made = tuple(
@@ -77,7 +78,8 @@ def _is_changed_again(step: Step, following: Step, kinds: Mapping[str, type[Adju
 def full_plan(
     station: Equipment, quick: bool = False, only: Collection[str] | None = None, parameters: Parameters | None = None
 ) -> CapturePlan:
-    """Every sequence whose instruments and targets the station has. `quick` takes fewer frames of each.
+    """Return a plan of every sequence whose instruments and targets the station has. `quick` takes fewer frames of
+    each.
 
     `only`: names of the sequences to take. `parameters`: values in place of those that a full session has. Raises
     InputError where the station can't take one of the sequences, and for a parameter that none of them has or that is
@@ -99,8 +101,9 @@ QUICK_LEVELS = 12
 
 
 def standards_plan(station: Equipment, quick: bool = False) -> CapturePlan:
-    """The captures that the standards ask for: EMVA 1288's levels up to saturation and spatial stacks, charts, edges,
-    boards, and the flare chart on the screen. `quick`: fewer levels, of which the standards' pages tell."""
+    """Return the captures that the standards ask for: EMVA 1288's levels up to saturation and spatial stacks, charts,
+    edges, boards, and the flare chart on the screen. `quick`: fewer levels, of which the standards' pages tell.
+    """
     names = [kind.name for kind in SEQUENCES.values() if kind.name in STANDARDS_SEQUENCES and kind.possible(station)]
     taken = list(full_plan(station, quick, names).sequences)
     count = QUICK_LEVELS if quick else EMVA_LEVELS

@@ -55,7 +55,7 @@ def confirm(store: Store, session: str, target: str, by: str, since: datetime | 
     if question_of(store, session) is None:  # also of no session: its folder isn't made
         raise InputError(f"session {session}: asks for nothing now; {target!r} isn't confirmed")
     folder = store.folder(session)
-    with _locked(folder):
+    with _lock_folder(folder):
         asked = question_of(store, session)
         if asked is None:
             raise InputError(f"session {session}: asks for nothing now; {target!r} isn't confirmed")
@@ -70,7 +70,7 @@ def confirm(store: Store, session: str, target: str, by: str, since: datetime | 
 
 def put_question(folder: Path, question: Question) -> None:
     """Ask, from now on, for the session of a folder."""
-    with _locked(folder):
+    with _lock_folder(folder):
         _write(folder, _Kept(**question.model_dump()))
 
 
@@ -95,7 +95,7 @@ def withdraw(folder: Path, question: Question | None = None) -> None:
     """Take a question away; None: whichever is there."""
     if not (folder / FILE).exists():
         return
-    with _locked(folder):
+    with _lock_folder(folder):
         kept = _read(folder)
         if question is None or (kept is not None and kept.since == question.since):
             (folder / FILE).unlink(missing_ok=True)
@@ -113,7 +113,7 @@ def _write(folder: Path, kept: _Kept) -> None:
 
 
 @contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _lock_folder(folder: Path) -> Iterator[None]:
     lock = Lock(folder / ".asks.lock")
     if not lock.acquire(PATIENCE_S):
         raise InputError(f"{lock.path}: another process holds it for {PATIENCE_S:g} s; look for one that hangs")

@@ -61,12 +61,12 @@ def put_into_queue(
         if row is None or row.state not in STARTABLE:
             state = "unknown" if row is None else row.state
             raise InputError(f"session {session_id} is {state}; only one that can be started or resumed can wait")
-        others = [other for other in waiting_rows(db) if other.id != session_id]
+        others = [row for row in waiting_rows(db) if row.id != session_id]
         now_at = row.queue_place if row.queue_place is not None else len(others)
         others.insert(min(place - 1 if place is not None else now_at, len(others)), row)
         row.state, row.not_before, row.error = "queued", not_before, f"{HELD}{held}" if held else None
-        for at, other in enumerate(others):
-            other.queue_place = at
+        for at, waiting_row in enumerate(others):
+            waiting_row.queue_place = at
 
 
 def expected_times(

@@ -104,5 +104,9 @@ class JournalEntry:
 
 
 def now() -> datetime:
-    """Return the time, UTC."""
+    """Return the time, UTC.
+
+    >>> now().tzname()
+    'UTC'
+    """
     return datetime.now(UTC)

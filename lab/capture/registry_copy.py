@@ -96,11 +96,11 @@ def _replace_rows(read: sa.Connection, written: sa.Connection) -> None:
         written.execute(table.delete())
     for table in tables:
         for rows in read.execution_options(stream_results=True).execute(table.select()).mappings().partitions(_ROWS):
-            for names, alike in _grouped(table, _in_utc(rows)).items():
+            for names, alike in _group_rows(table, _in_utc(rows)).items():
                 written.execute(table.insert(), [{name: row[name] for name in names} for row in alike])
 
 
-def _grouped(table: sa.Table, rows: Iterator[dict[str, Any]]) -> dict[tuple[str, ...], list[dict[str, Any]]]:
+def _group_rows(table: sa.Table, rows: Iterator[dict[str, Any]]) -> dict[tuple[str, ...], list[dict[str, Any]]]:
     """Group rows by the columns that they state: a document that is NULL would become JSON's null."""
     documents = {column.name for column in table.columns if isinstance(column.type, sa.JSON)}
     groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}

@@ -75,7 +75,7 @@ def restore(
     it holds something and `replace` isn't given, where a process works with it or it belongs to another user, where
     the generation is of a newer calibench, a file of it is damaged, and where the disk hasn't the room.
     """
-    chosen = _chosen(backup, generation)
+    chosen = _choose_generation(backup, generation)
     target = settings.data.resolve()
     if backup.resolve() == target or backup.resolve().is_relative_to(target) or target.is_relative_to(backup.resolve()):
         raise InputError(f"{target}: is the backup or lies in it; name another folder by --to")
@@ -123,7 +123,7 @@ def repair(backup: Path, store: Store, advance: Advance = lambda text, share: No
     generations = list_generations(backup)
     away = store.root / f"{_BEFORE}{now():%Y%m%d-%H%M%S}"
     restored, lost = [], []
-    wanted = list(_wanted(store, generations))
+    wanted = list(_list_wanted_files(store, generations))
     for number, (path, expected) in enumerate(wanted):
         advance(path, number / len(wanted))
         file = store.root / path
@@ -151,7 +151,7 @@ def repair(backup: Path, store: Store, advance: Advance = lambda text, share: No
     return RepairReport(tuple(restored), tuple(lost), away if away.exists() else None)
 
 
-def _wanted(store: Store, generations: list[Generation]) -> Iterator[tuple[str, str | None]]:
+def _list_wanted_files(store: Store, generations: list[Generation]) -> Iterator[tuple[str, str | None]]:
     """Yield the files that a data folder should have, with the SHA-256 of those that never change.
 
     Of packed sessions and of recordings, the recorded SHA-256 of the newest generation counts. Of other files none
@@ -182,7 +182,7 @@ def _damage_of(file: Path, expected: str | None) -> str | None:
         return f"can't be read ({error.strerror})"
 
 
-def _chosen(backup: Path, name: str | None) -> Generation:
+def _choose_generation(backup: Path, name: str | None) -> Generation:
     known = list_generations(backup)
     if name is None:
         return known[0]
@@ -244,9 +244,9 @@ def _stage(generation: Generation, target: Path, advance: Advance) -> None:
     staging = target / STAGED
     folder = staging / generation.name
     shutil.rmtree(target / _DONE, ignore_errors=True)
-    for other in staging.glob("[!.]*"):
-        if other.name != generation.name:
-            remove_tree(other)
+    for previous in staging.glob("[!.]*"):
+        if previous.name != generation.name:
+            remove_tree(previous)
     folder.mkdir(parents=True, exist_ok=True)
     files = generation.record.files
     missing = [

@@ -160,7 +160,7 @@ class Rescue:
         for station in self._stations:
             station.stop_others()
 
-    def made_safe(self, patience_s: float) -> dict[str, Lock]:
+    def wait_until_safe(self, patience_s: float) -> dict[str, Lock]:
         """Wait, for `patience_s` at most, for the instruments. The sessions whose stations are safe, with their locks,
         which are held; those of the others are released, as the recovery takes them while an instrument that doesn't
         answer is still waited for here."""
@@ -179,9 +179,13 @@ _at_start: list[Rescue] = []
 
 
 def make_safe_at_start(arguments: Sequence[str]) -> None:
-    """What `calibench serve ARGUMENTS` does first: have the stations of its data folder's sessions that ended by a
-    crash made safe, and say when they are. While the instruments answer, the service may be loaded;
-    `made_safe_at_start` waits for them."""
+    """Make the stations safe whose sessions ended by a crash, and report when they are: what `calibench serve` does
+    first.
+
+    arguments : of `calibench serve`, for the data folder
+
+    While the instruments answer, the service may be loaded; `wait_until_safe_at_start` waits for them.
+    """
     if "CALIBENCH_DATABASE_URL" in os.environ:
         return
     data = os.environ.get("CALIBENCH_DATA", "calibench-data")
@@ -197,10 +201,10 @@ def _say(line: str) -> None:
     print(escaped(line), file=sys.stderr, flush=True)
 
 
-def made_safe_at_start() -> dict[str, Lock]:
+def wait_until_safe_at_start() -> dict[str, Lock]:
     """Return the sessions whose stations `make_safe_at_start` made safe, with their locks, which are held. To be called
     before somebody else speaks to the same instruments."""
-    return {name: lock for rescue in _at_start for name, lock in rescue.made_safe(INSTRUMENTS_S).items()}
+    return {name: lock for rescue in _at_start for name, lock in rescue.wait_until_safe(INSTRUMENTS_S).items()}
 
 
 def _check_shut(monochromator: Any) -> None:

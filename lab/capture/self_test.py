@@ -52,8 +52,10 @@ def self_test(station: Station, name: str, connect: Callable[[Station], Drivers]
     """Return the self-test of one instrument (`monochromator`, `cameras.left`, ...). Raises InputError if the station
     hasn't got it."""
     _entry(station, name)
-    side = _said(name).partition(" ")[2]
-    return _self_test(_said(name), connect(station).all[_said(name)], data_sheets(station).get(side))
+    side = _format_device_name(name).partition(" ")[2]
+    return _self_test(
+        _format_device_name(name), connect(station).all[_format_device_name(name)], data_sheets(station).get(side)
+    )
 
 
 def data_sheets(station: Station) -> dict[str, DataSheet]:
@@ -61,7 +63,7 @@ def data_sheets(station: Station) -> dict[str, DataSheet]:
     return {side: camera.datasheet for side, camera in station.cameras.items()}
 
 
-def _said(name: str) -> str:
+def _format_device_name(name: str) -> str:
     """Return a device's name in messages: `camera left` for `cameras.left`."""
     family, _, side = name.partition(".")
     return f"camera {side}" if side else family
@@ -118,7 +120,7 @@ def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
     except OSError as error:
         raise cannot_write(file, error, "name another file") from error
     try:
-        answer = _said(name)
+        answer = _format_device_name(name)
         try:
             made = driver(answer.partition(" ")[0], entry.driver)(entry.address, recorder=recorder, **entry.settings)
         except (InstrumentError, TypeError) as error:
@@ -149,19 +151,25 @@ def station_text(instruments: Iterable[Found]) -> str:
     taken: set[str] = set()
     there = list(instruments)
     pair = sum(instrument.family == "camera" for instrument in there) > 1
-    for one in there:
-        if one.family == "camera" and (side := next(sides, None)) is not None:
-            sensor = _sensor(side, one)
-            lines += ["", *_camera_table(side, one, sensor, pair)]
+    for instrument in there:
+        if instrument.family == "camera" and (side := next(sides, None)) is not None:
+            sensor = _sensor(side, instrument)
+            lines += ["", *_camera_table(side, instrument, sensor, pair)]
             cameras += 1
             if sensor.exposure_s is not None:
                 exposures.append(sensor.exposure_s)
-        elif one.family and one.family != "camera" and one.family not in taken:
-            taken.add(one.family)
-            lines += ["", f"# {one.what}", f"[{one.family}]", f'driver = "{one.name}"', f'address = "{one.address}"']
-            lines += [f'{key} = ""  # to be filled in' for key in one.needs]
+        elif instrument.family and instrument.family != "camera" and instrument.family not in taken:
+            taken.add(instrument.family)
+            lines += [
+                "",
+                f"# {instrument.what}",
+                f"[{instrument.family}]",
+                f'driver = "{instrument.name}"',
+                f'address = "{instrument.address}"',
+            ]
+            lines += [f'{key} = ""  # to be filled in' for key in instrument.needs]
         else:
-            lines += ["", f"# also connected: {one.what} at {one.address}"]
+            lines += ["", f"# also connected: {instrument.what} at {instrument.address}"]
     if not cameras:
         raise DeviceError(
             "no camera is connected that a driver here reaches: plug it in, give --usbip HOST:PORT, or install its "

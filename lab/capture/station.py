@@ -119,11 +119,11 @@ class Station(Frozen):
                 continue
             # A port has several names: /dev/ttyUSB0, and a link in /dev/serial/by-id.
             port = str(Path(entry.address).resolve()) if entry.address.startswith("/") else entry.address
-            other = taken.setdefault(port, table)
-            if other != table:
+            first_table = taken.setdefault(port, table)
+            if first_table != table:
                 raise ValueError(
-                    f"[{other}] and [{table}] both have the address {port}; one port serves one instrument: correct "
-                    "one of them"
+                    f"[{first_table}] and [{table}] both have the address {port}; one port serves one instrument: "
+                    "correct one of them"
                 )
         return self
 
@@ -163,7 +163,7 @@ class Station(Frozen):
         return float(stated.pop() or 0.0)
 
     def frame_px(self, side: Side) -> tuple[int, int]:
-        """Rows and columns of one camera's frame."""
+        """Return rows and columns of one camera's frame."""
         sheet = self.cameras[side].datasheet
         return sheet.rows, sheet.cols
 
@@ -175,7 +175,7 @@ class Station(Frozen):
         return {name: entry for name, entry in addresses.items() if entry is not None}
 
     def list_targets(self, kind: type[TargetT]) -> dict[str, TargetT]:
-        """Targets of one kind by name, in the station file's order."""
+        """Return the targets of one kind by name, in the station file's order."""
         return {name: target for name, target in self.targets.items() if isinstance(target, kind)}
 
     def one(self, kind: type[Target]) -> str:
@@ -186,7 +186,7 @@ class Station(Frozen):
         raise InputError(f"station: no target of kind {wanted!r}; add one under [targets] of the station file")
 
     def lacks(self, *families: str) -> tuple[str, ...]:
-        """Those of the instrument families that the station doesn't have."""
+        """Return the instrument families that the station doesn't have."""
         return tuple(family for family in families if getattr(self, family) is None)
 
 

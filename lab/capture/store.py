@@ -112,13 +112,13 @@ class Store:
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[Session]:
-        """A database session that only reads."""
+        """Open a database session that only reads."""
         with self._read() as session:
             yield session
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[Session]:
-        """A database session whose changes are committed together, or not at all."""
+        """Open a database session whose changes are committed together, or not at all."""
         with self._write.begin() as session:
             yield session
 
@@ -276,7 +276,7 @@ class Store:
         return again.model_copy(update={"state": "interrupted", "error": why})
 
     def session(self, session_id: str) -> SessionInfo:
-        """One session."""
+        """Return a session."""
         with self.reading() as db:
             info = self._info(db, self._row(db, session_id))
         return self._now(info)
@@ -289,7 +289,7 @@ class Store:
         search: str = "",
         only: Sequence[str] | None = None,
     ) -> list[SessionInfo]:
-        """Sessions, the newest first: `limit` at most, those that follow the session `after` in this order.
+        """Return sessions, the newest first: `limit` at most, those that follow the session `after` in this order.
 
         `search`: only those that have each of its words in their id, name, notes, their station's name or what their
         instruments reported. `only`: ids of those that are asked for."""
@@ -300,7 +300,7 @@ class Store:
             SessionRow.runs,
             SessionRow.request,
         )
-        asked = _searched(sa.select(SessionRow).options(*map(defer, documents)), search, only)
+        asked = _confine_query(sa.select(SessionRow).options(*map(defer, documents)), search, only)
         with self.reading() as db:
             if after is not None:
                 last = self._row(db, after)
@@ -312,7 +312,7 @@ class Store:
     def count_sessions(self, *, search: str = "", only: Sequence[str] | None = None) -> int:
         """Return how many sessions there are, of those that `sessions` answers."""
         with self.reading() as db:
-            return db.scalars(_searched(sa.select(sa.func.count()).select_from(SessionRow), search, only)).one()
+            return db.scalars(_confine_query(sa.select(sa.func.count()).select_from(SessionRow), search, only)).one()
 
     def describe_session(self, session_id: str, name: str | None = None, notes: str | None = None) -> None:
         """Give a session another name, or other notes; None leaves them. Raises InputError for control characters."""
@@ -330,7 +330,7 @@ class Store:
             return {state: number for state, number in counted}  # noqa: C416  (rows, not pairs, to a type checker)
 
     def under_way(self) -> list[str]:
-        """Ids of the sessions that are recorded as running or paused, also where their process died."""
+        """Return the ids of the sessions that are recorded as running or paused, also where their process died."""
         with self.reading() as db:
             return list(db.scalars(sa.select(SessionRow.id).where(SessionRow.state.in_(("running", "paused")))))
 
@@ -345,7 +345,7 @@ class Store:
             return Station.model_validate(self._row(db, session_id).station)
 
     def details(self, session_id: str) -> SessionDetails:
-        """One session with its provenance, in one reading."""
+        """Return one session with its provenance, in one reading."""
         with self.reading() as db:
             row = self._row(db, session_id)
             runs = tuple(RunRecord.model_validate(run) for run in row.runs)
@@ -353,7 +353,7 @@ class Store:
         return replace(details, info=self._now(details.info))
 
     def runs(self, session_id: str) -> list[RunRecord]:
-        """Provenance: every run of a session, in order."""
+        """Return the provenance: every run of a session, in order."""
         with self.reading() as db:
             return [RunRecord.model_validate(run) for run in self._row(db, session_id).runs]
 
@@ -365,8 +365,8 @@ class Store:
             station = row.station.get("name", "")
             asked = sa.select(SessionRow.id, SessionRow.station, SessionRow.runs)
             asked = asked.where(sa.tuple_(SessionRow.created, SessionRow.id) <= sa.tuple_(row.created, row.id))
-            for id, other, runs in db.execute(asked.order_by(SessionRow.created.desc(), SessionRow.id.desc())):
-                if runs and other.get("name", "") == station:
+            for id, station_keys, runs in db.execute(asked.order_by(SessionRow.created.desc(), SessionRow.id.desc())):
+                if runs and station_keys.get("name", "") == station:
                     return id, RunRecord.model_validate(runs[-1])
         return None
 
@@ -424,7 +424,7 @@ class Store:
     # --- the journal --------------------------------------------------------------------------------------------------
 
     def journal(self, session_id: str) -> list[JournalEntry]:
-        """All steps of a session in order, done or to do."""
+        """Return all steps of a session in order, done or to do."""
         with self.reading() as db:
             self._row(db, session_id)
             rows = db.scalars(sa.select(StepRow).where(StepRow.session_id == session_id).order_by(StepRow.position))
@@ -469,7 +469,7 @@ class Store:
         return True
 
     def lab_time_s(self, session_id: str) -> float:
-        """Time that the finished steps of a session took, s, whatever lay between them."""
+        """Return the time that the finished steps of a session took, s, whatever lay between them."""
         asked = sa.select(StepRow.started, StepRow.finished).where(
             StepRow.session_id == session_id, StepRow.started.is_not(None), StepRow.finished.is_not(None)
         )
@@ -542,13 +542,13 @@ class Store:
             return [CaptureInfo.model_validate(row) for row in db.scalars(asked)]
 
     def count_captures(self, session_id: str, search: str = "") -> dict[tuple[str, str], int]:
-        """(kind, side) -> how many captures a session has of them whose name has each word of `search`."""
+        """Count a session's captures by (kind, side), of those whose name has each word of `search`."""
         asked = sa.select(CaptureRow.kind, CaptureRow.side, sa.func.count()).group_by(CaptureRow.kind, CaptureRow.side)
         with self.reading() as db:
             return {(kind, side): n for kind, side, n in db.execute(_captures_of(asked, session_id, search=search))}
 
     def capture(self, capture_id: int) -> CaptureInfo:
-        """One capture by its id in the registry."""
+        """Return a capture by its id in the registry."""
         with self.reading() as db:
             row = db.get(CaptureRow, capture_id)
             if row is None:
@@ -653,7 +653,7 @@ class Store:
         return result_id
 
     def result(self, result_id: str) -> ResultInfo:
-        """One result by its own id or by the id of the job that made it."""
+        """Return a result by its own id or by the id of the job that made it."""
         with self.reading() as db:
             row = db.get(ResultRow, result_id)
             row = row or db.scalars(sa.select(ResultRow).where(ResultRow.job_id == result_id)).first()
@@ -662,13 +662,13 @@ class Store:
             return ResultInfo.model_validate(row)
 
     def newest_results(self, source: str) -> dict[str, str]:
-        """Kind -> id of the newest result of that kind, of one session (or recording set's folder)."""
+        """Return the id of the newest result of each kind, of one session (or recording set's folder)."""
         asked = sa.select(ResultRow.kind, ResultRow.id).where(ResultRow.source == source).order_by(ResultRow.created)
         with self.reading() as db:
             return {row.kind: row.id for row in db.execute(asked)}
 
     def results(self, source: str | None = None, kind: str | None = None) -> list[ResultInfo]:
-        """Results, the newest first; of one session (or recording set's folder) and one kind, or all."""
+        """Return results, the newest first; of one session (or recording set's folder) and one kind, or all."""
         asked = sa.select(ResultRow).order_by(ResultRow.created.desc())
         if source is not None:
             asked = asked.where(ResultRow.source == source)
@@ -680,8 +680,9 @@ class Store:
     # --- keys ---------------------------------------------------------------------------------------------------------
 
     def keys(self, anew: bool = True) -> list[tuple[str, str, str]]:
-        """(name, scope, SHA-256) of every API key; unless `anew`, as another process may have left them `KEYS_S` ago.
-        Where the registry can't be read, as they were read last."""
+        """Return (name, scope, SHA-256) of every API key; unless `anew`, as another process may have left them `KEYS_S`
+        ago. Where the registry can't be read, as they were read last.
+        """
         if anew or not self.knows_keys():
             try:
                 with self.reading() as db:
@@ -737,7 +738,7 @@ class Store:
             db.execute(sa.delete(HaltTokenRow).where(HaltTokenRow.sha256 == sha256))
 
 
-def _searched(asked: Any, search: str, only: Sequence[str] | None) -> Any:
+def _confine_query(asked: Any, search: str, only: Sequence[str] | None) -> Any:
     """Return a query of sessions, confined to those that have all words of a text, and to some ids."""
     for word in search.split():
         places = (SessionRow.id, SessionRow.name, SessionRow.notes, SessionRow.station["name"].as_string())

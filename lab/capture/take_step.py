@@ -160,19 +160,19 @@ def repeats_ahead(steps: Sequence[Step | None]) -> list[int]:
     """Return how many of the steps that follow each at once only repeat its exposure; None: a step that isn't taken."""
     counts = [0] * len(steps)
     for at in range(len(steps) - 2, -1, -1):
-        step, other = steps[at], steps[at + 1]
-        if step is not None and other is not None and _repeats(step, other):
+        step, following = steps[at], steps[at + 1]
+        if step is not None and following is not None and _repeats(step, following):
             counts[at] = counts[at + 1] + 1
     return counts
 
 
-def _repeats(step: Step, other: Step) -> bool:
+def _repeats(step: Step, following: Step) -> bool:
     """Return whether the second step does nothing but expose as the first did."""
     return (
-        bool(step.captures and other.captures)
-        and other.radiance is None
-        and other.setting == step.setting
-        and other.exposure == step.exposure
+        bool(step.captures and following.captures)
+        and following.radiance is None
+        and following.setting == step.setting
+        and following.exposure == step.exposure
     )
 
 
@@ -228,7 +228,7 @@ def take(
         yield from _shoot(instruments, shot)
         retaken += cameras.retaken
         files += cameras.stored.values()
-        captures = _completed(step, instruments, dummies)
+        captures = _complete_keys(step, instruments, dummies)
         result |= {"level": dict(cameras.levels)}
         if retaken:
             result["retaken"] = retaken
@@ -285,7 +285,7 @@ def _exposures(step: Step, instruments: Instruments, results: Mapping[str, Mappi
     }
 
 
-def _completed(step: Step, instruments: Instruments, dummies: int) -> tuple[Capture, ...]:
+def _complete_keys(step: Step, instruments: Instruments, dummies: int) -> tuple[Capture, ...]:
     """Return the step's captures with the keys that the trigger, the `dummies` before it, and the instruments tell."""
     without = instruments.photodiode if instruments.photodiode and instruments.photodiode.measured is None else None
     readings = {

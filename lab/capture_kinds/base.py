@@ -162,15 +162,15 @@ class Capture(Open):
 
     @classmethod
     def unsupported(cls, document: dict[str, Any]) -> str | None:
-        """Why this version skips a capture that the format allows; None if it is supported."""
+        """Return why this version skips a capture that the format allows; None if it is supported."""
         return None
 
     def problems(self, rows: int, cols: int) -> Iterator[str]:
-        """Errors in the keys of a capture from a camera of `rows` x `cols` pixels: value, limit, remedy."""
+        """Yield the errors in the keys of a capture from a camera of `rows` x `cols` pixels: value, limit, remedy."""
         return iter(())
 
     def remarks(self) -> Iterator[str]:
-        """Warnings about the keys, with a remedy. The capture is used nevertheless."""
+        """Yield warnings about the keys, with a remedy. The capture is used nevertheless."""
         if (self.exposure_s or 0.0) > LONGEST_EXPOSURE_S:
             yield (
                 f"exposure_s is above {LONGEST_EXPOSURE_S:g} s: state it in seconds, not in milliseconds or "
@@ -193,7 +193,7 @@ def _mark(annotation: Any) -> Names | None:
 
 
 def names_in(item: Open) -> Iterator[tuple[str, Names, str]]:
-    """(dotted key, what it names, value) of every key of a manifest's object that names something."""
+    """Yield (dotted key, what it names, value) of every key of a manifest's object that names something."""
     for key, field in type(item).model_fields.items():
         value = getattr(item, key)
         if isinstance(value, Open):
@@ -429,7 +429,10 @@ MOST_STEPS = 50_000
 
 
 def check_number(steps: float) -> None:
-    """Raises ValueError for more steps than a sequence may have."""
+    """Check how many steps a sequence has. Raises ValueError for more than `MOST_STEPS`.
+
+    >>> check_number(100)
+    """
     if steps > MOST_STEPS:
         raise ValueError(f"{steps:g} steps are more than the limit of {MOST_STEPS}; give fewer frames, or fewer places")
 
@@ -438,22 +441,38 @@ SEQUENCES: dict[str, type[Sequence]] = {}
 
 
 def name_of(step_id: str) -> str:
-    """Return a step's id as the stem of a file name."""
+    """Return a step's id as the stem of a file name.
+
+    >>> name_of("dark/0.1s/1")
+    'dark-0.1s-1'
+    """
     return step_id.replace("/", "-")
 
 
 def frame_path(step_id: str, side: str) -> str:
-    """Path in the session of a step's frame of one side."""
+    """Return the path in the session of a step's frame of one side.
+
+    >>> frame_path("dark/0.1s/1", "left")
+    'frames/dark-0.1s-1-left.npy'
+    """
     return f"frames/{name_of(step_id)}-{side}.npy"
 
 
 def spectrum_path(step_id: str) -> str:
-    """Path in the session of the spectrum that a step measures."""
+    """Return the path in the session of the spectrum that a step measures.
+
+    >>> spectrum_path("narrowband/550")
+    'spectra/narrowband-550.csv'
+    """
     return f"spectra/{name_of(step_id)}.csv"
 
 
 def planned_keys(step_id: str, side: Side) -> dict[str, Any]:
-    """Return the keys that every capture of a step has before it is taken."""
+    """Return the keys that every capture of a step has before it is taken.
+
+    >>> planned_keys("dark/0.1s/1", "left")["id"]
+    'dark-0.1s-1-left'
+    """
     return {"id": f"{name_of(step_id)}-{side}", "side": side, "frame": frame_path(step_id, side), "exposure_s": 0.0}
 
 
@@ -507,7 +526,7 @@ def register(kind: type[Capture]) -> None:
 
 @contextmanager
 def registered(kind: type[Capture]) -> Iterator[None]:
-    """Context in which the kind is registered, too."""
+    """Register the kind within the block."""
     tables: tuple[dict[str, Any], ...] = (CAPTURES.models, TARGETS.models, SEQUENCES)
     before = [dict(table) for table in tables]
     try:

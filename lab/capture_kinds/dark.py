@@ -81,7 +81,7 @@ class DarkSequence(Sequence):
     ] = None
 
     @model_validator(mode="after")
-    def _bounded(self) -> Self:
+    def _check_bounds(self) -> Self:
         check_number(len(self.exposures_s) * self.frames)
         return self
 

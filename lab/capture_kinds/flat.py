@@ -86,7 +86,7 @@ class FlatSequence(Sequence):
     colour_temperature_k: ColourTemperature = None
 
     @model_validator(mode="after")
-    def _bounded(self) -> Self:
+    def _check_bounds(self) -> Self:
         check_lamp(self.lamp_level, self.colour_temperature_k)
         check_number(len(self.levels) * self.frames * (1 + len(self.gains_db)) + self.darks_after)
         return self

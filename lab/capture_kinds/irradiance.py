@@ -49,8 +49,9 @@ class IrradianceCapture(Capture):
 
 
 def irradiance_nm(step: Step) -> float | None:
-    """Wavelength (nm) at which a photodiode measures the irradiance beside a step's captures; None: it has one
-    responsivity, and measures in light of one wavelength alone."""
+    """Return the wavelength (nm) at which a photodiode measures the irradiance beside a step's captures; None: it has
+    one responsivity, and measures in light of one wavelength alone.
+    """
     captures = [capture for capture in step.captures if isinstance(capture, IrradianceCapture)]
     if not captures:
         return None

@@ -85,5 +85,12 @@ def lamp_channels(
 
 
 def lamp_words(level: float, colour_temperature_k: float | None) -> str:
-    """Return a part of a step's id that says how the light source is set: `lamp0.5`, `lamp0.5-3000K`."""
+    """Return a part of a step's id that says how the light source is set.
+
+    level : share of its most, 0..1
+    colour_temperature_k : None where it isn't asked for
+
+    >>> lamp_words(0.5, 3000.0)
+    'lamp0.5-3000K'
+    """
     return f"lamp{level:g}" + ("" if colour_temperature_k is None else f"-{colour_temperature_k:g}K")

@@ -179,7 +179,11 @@ class ScreenSequence(Sequence):
 
 
 def pattern_path(kind: str) -> str:
-    """Path in the session of a pattern's cells."""
+    """Return the path in the session of a pattern's cells.
+
+    >>> pattern_path("bernoulli")
+    'targets/bernoulli.npy'
+    """
     return f"targets/{kind}.npy"
 
 

@@ -80,24 +80,34 @@ class TurnTarget(Adjustment):
         return self.angle_deg == 0.0
 
 
-def turned_layout(region: EdgeLayout, turn_deg: float, rows: int, cols: int) -> EdgeLayout | None:
-    """Return where an edge lies in a frame of `rows` x `cols` after its holder was turned by `turn_deg` about the
-    middle of the frame; None: no longer whole in the frame. Its angle stays within -45 to 135 deg."""
+def turn_layout(region: EdgeLayout, turn_deg: float, rows: int, cols: int) -> EdgeLayout | None:
+    """Return where an edge lies in a frame after its holder was turned about the middle of the frame.
+
+    region : where it lies before
+    turn_deg : positive takes the top of the edge to the right; the angle stays within -45 to 135 deg
+    rows, cols : of the frame, px
+
+    Returns None where the region is no longer whole in the frame.
+
+    >>> edge = EdgeLayout(name="top", region=(0, 40, 20, 60), angle_deg=5.0, field_mm=(0.0, 0.0))
+    >>> turn_layout(edge, 90.0, 100, 100).region
+    (40, 80, 60, 100)
+    """
     turn = math.radians(turn_deg)
     row0, col0, row1, col1 = region.region
-    at_row, at_col = _turned(0.5 * (row0 + row1 - rows), 0.5 * (col0 + col1 - cols), turn)
+    at_row, at_col = _turn_place(0.5 * (row0 + row1 - rows), 0.5 * (col0 + col1 - cols), turn)
     top, left = round(0.5 * rows + at_row - 0.5 * (row1 - row0)), round(0.5 * cols + at_col - 0.5 * (col1 - col0))
     place = (top, left, top + row1 - row0, left + col1 - col0)
     if top < 0 or left < 0 or place[2] > rows or place[3] > cols:
         return None
-    field_row, field_col = _turned(*region.field_mm, turn)
+    field_row, field_col = _turn_place(*region.field_mm, turn)
     angle = (region.angle_deg + turn_deg + 45.0) % 180.0 - 45.0
     return EdgeLayout(
         name=region.name, region=place, angle_deg=round(angle, 6), field_mm=(round(field_row, 4), round(field_col, 4))
     )
 
 
-def _turned(row: float, col: float, turn: float) -> tuple[float, float]:
+def _turn_place(row: float, col: float, turn: float) -> tuple[float, float]:
     """Return a place after a turn (rad) about the origin that takes the top, towards negative rows, to the right."""
     return row * math.cos(turn) + col * math.sin(turn), col * math.cos(turn) - row * math.sin(turn)
 
@@ -183,7 +193,7 @@ def edge_steps(
             for side in station.sides:
                 layout = edge.left if side == "left" else edge.right
                 for region in _regions(layout, sequence.turn_deg, station, side):
-                    own = {
+                    geometry = {
                         "id": "-".join(filter(None, (prefix, name, str(frame), region.name, side))),
                         "kind": get_args(kind.model_fields["kind"].annotation)[0],
                         "region": region.region,
@@ -192,7 +202,7 @@ def edge_steps(
                         "field_mm": region.field_mm,
                         "colour_temperature_k": sequence.colour_temperature_k,
                     }
-                    captures.append(kind.model_validate(planned_keys(id, side) | own | keys))
+                    captures.append(kind.model_validate(planned_keys(id, side) | geometry | keys))
             made.append(
                 Step(
                     id=id,
@@ -215,7 +225,7 @@ def edge_steps(
 def _regions(layout: EdgeLayouts | None, turn_deg: float, station: Equipment, side: Side) -> Iterator[EdgeLayout]:
     """Yield the edges in one camera's frame, after their turn."""
     for region in () if layout is None else layout.regions:
-        turned = turned_layout(region, turn_deg, *station.frame_px(side)) if turn_deg else region
+        turned = turn_layout(region, turn_deg, *station.frame_px(side)) if turn_deg else region
         if turned is not None:
             yield turned
 

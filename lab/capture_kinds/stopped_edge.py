@@ -46,7 +46,7 @@ class StoppedEdgeSequence(EdgeSequence):
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
-        """None: a full session leaves the lens alone."""
+        """Return None: a full session leaves the lens alone."""
         return None
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:

@@ -80,14 +80,14 @@ def show(id: Id, limits: LimitsFile = None, json: Json = None, data: StoreFolder
     Example: calibench calibrations show 20261127-101500-7f3ad2
     """
     from lab.calibration.life import calibration, figures
-    from lab.calibration.limits import judged
-    from lab.formats.results.words import shown_unit
+    from lab.calibration.limits import judge_figures
+    from lab.formats.results.words import format_unit
 
     check_writable(json)
     store = store_to_read(data)
     record = calibration(store, id)
     chosen = record.limits if limits is None and record.limits is not None else _standing(store, limits)
-    by_limit = judged(figures(store, record.id), chosen) if chosen is not None else ()
+    by_limit = judge_figures(figures(store, record.id), chosen) if chosen is not None else ()
     write_json(record.model_copy(update={"limits": chosen, "judgements": by_limit}), json)
     if str(json) != "-":
         who = f" by {record.certified_by} at {record.certified:%Y-%m-%d %H:%M}" if record.certified else ""
@@ -98,7 +98,7 @@ def show(id: Id, limits: LimitsFile = None, json: Json = None, data: StoreFolder
                 ("" if judgement.value is None else f"{judgement.value:.6g}"),
                 ("" if judgement.std is None else f"{judgement.std:.2g}"),
             )
-            numbers = (value, std, shown_unit(judgement.unit), judgement.limit.good_text)
+            numbers = (value, std, format_unit(judgement.unit), judgement.limit.good_text)
             table.add_row(
                 escape(judgement.title or judgement.figure),
                 judgement.side or "",
@@ -165,7 +165,7 @@ def history(
     """
     from lab.calibration.life import figure_names
     from lab.calibration.life import history as looked_up
-    from lab.formats.results.words import plain_name, shown_unit, unit_of
+    from lab.formats.results.words import format_unit, plain_name, unit_of
 
     check_writable(json)
     store = store_to_read(data)
@@ -176,14 +176,14 @@ def history(
             raise InputError(f"camera {camera!r} has no calibration in {store.root}; cameras that have: {cameras}")
         for name, of, where in known:
             if camera in ("", name):
-                read_as = ", ".join(part for part in (plain_name(of, where), shown_unit(unit_of(of))) if part)
+                read_as = ", ".join(part for part in (plain_name(of, where), format_unit(unit_of(of))) if part)
                 out.print(escape("  ".join(part for part in (name, of, where, f"({read_as})") if part)))
         return
     history = looked_up(store, camera, figure, place, _standing(store, limits))
     write_json(history, json)
     if str(json) != "-":
         warm = any(point.temperature_c is not None for point in history.points)
-        unit = shown_unit(history.unit)
+        unit = format_unit(history.unit)
         out.print(escape(f"{history.title or history.figure}{f', {unit}' if unit else ''}, of {history.camera}"))
         at = ("sensor, °C",) if warm else ()
         table = _table("calibration", "begun (UTC)", "state", "value", "std", *at, "mark", "sigma", "drift")

@@ -155,7 +155,7 @@ def _write_geometry(kind: str, to: Path, content: CameraFile, options: ExportOpt
     """The geometry of a camera, or of a pair, as one of `OF_A_PAIR`; what it has no place for."""
     from lab.formats.camera_file import read_camera
     from lab.formats.geometry_files import (
-        paired,
+        pair_cameras,
         write_colmap,
         write_kalibr,
         write_mrcal,
@@ -179,7 +179,7 @@ def _write_geometry(kind: str, to: Path, content: CameraFile, options: ExportOpt
     stereo = read_result(FitResult, options.fit).stereo
     if stereo is None:
         raise InputError(f"{options.fit}: has no pose of a stereo pair; fit both cameras' views of a board")
-    return writer(to, *paired(content, read_camera(options.right), stereo))
+    return writer(to, *pair_cameras(content, read_camera(options.right), stereo))
 
 
 def export_tiled(session: str, to: str, data: Path | None) -> None:

@@ -84,7 +84,7 @@ def report_standards(
 
 def print_standards(result: StandardsResult) -> None:
     """Print the figures of each standard, and the requirements that aren't met."""
-    from lab.formats.results.words import measured
+    from lab.formats.results.words import format_value
 
     for reading in result.readings:
         out.print(f"\n[bold]{escape(reading.standard)}[/], {reading.side}, {escape(reading.subject)}")
@@ -92,7 +92,7 @@ def print_standards(result: StandardsResult) -> None:
         for figure in reading.figures:
             value = escape(figure.reason)
             if figure.estimate is not None:
-                value = escape(measured(figure.estimate.value, figure.estimate.std, figure.estimate.unit))
+                value = escape(format_value(figure.estimate.value, figure.estimate.std, figure.estimate.unit))
                 value += "" if figure.by_the_standard else "  [yellow]not by the standard[/]"
             table.add_row(escape(figure.symbol), escape(figure.quantity), value)
         out.print(table)

@@ -191,16 +191,20 @@ def print_resolving(diagnosis: DiagnosisResult) -> None:
 
 
 def print_comparison(comparison: ComparisonResult, every: bool) -> None:
-    from lab.formats.results.words import measured, shown_unit
+    from lab.formats.results.words import format_unit, format_value
 
     shown = [row for row in comparison.changes if every or row.changed]
     table = Table(box=None, pad_edge=False)
     for heading in ("quantity", "side", "where", "A", "B", "B - A", "unit", "sigma", "changed", "figure"):
         table.add_column(heading)
     for row in sorted(shown, key=lambda row: -row.significance_sigma):
-        values = (measured(row.a, row.a_std), measured(row.b, row.b_std), measured(row.difference, row.difference_std))
+        values = (
+            format_value(row.a, row.a_std),
+            format_value(row.b, row.b_std),
+            format_value(row.difference, row.difference_std),
+        )
         of = f"{row.where} (worst of {row.n})" if row.n > 1 else row.where
-        marks = (shown_unit(row.unit), f"{row.significance_sigma:.1f}", "yes" if row.changed else "no")
+        marks = (format_unit(row.unit), f"{row.significance_sigma:.1f}", "yes" if row.changed else "no")
         table.add_row(escape(row.title or row.name), row.side or "", escape(of), *values, *marks, escape(row.name))
     if table.row_count:
         out.print(table)

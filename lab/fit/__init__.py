@@ -59,7 +59,7 @@ def fit_recording_set(
     total, done = len(set(steps) - {"stereo"}) * len(sides) + paired, 0
     lock = threading.Lock()
 
-    def told(side: Side | None, step: Step) -> None:
+    def report_step(side: Side | None, step: Step) -> None:
         nonlocal done
         with lock:
             done += 1
@@ -68,12 +68,12 @@ def fit_recording_set(
 
     if len(sides) > 1 and _pixels(recordings) > WORTH_PROCESSES_PX:
         tasks = {side: partial(fit_side, recordings.for_one_of(len(sides)), side, steps) for side in sides}
-        fitted = in_processes(recordings, tasks, told, "fit")
-        for one in fitted.values():  # the pair is fitted, and a diagnosis rests, on the same
-            recordings.keep(one.summaries)
+        fitted = in_processes(recordings, tasks, report_step, "fit")
+        for side_fit in fitted.values():  # the pair is fitted, and a diagnosis rests, on the same
+            recordings.keep(side_fit.summaries)
     else:
-        fitted = {side: fit_side(recordings, side, steps, partial(told, side)) for side in sides}
-    cameras = {side: one.camera for side, one in fitted.items()}
+        fitted = {side: fit_side(recordings, side, steps, partial(report_step, side)) for side in sides}
+    cameras = {side: side_fit.camera for side, side_fit in fitted.items()}
 
     def pair() -> StereoFit:
         both = {side: camera.geometry for side, camera in cameras.items() if camera.geometry is not None}
@@ -82,23 +82,25 @@ def fit_recording_set(
             raise NotDetermined("stereo", f"no geometry of the {missing} side; capture charuco poses with both cameras")
         return fit_stereo(recordings, both["left"], both["right"])
 
-    found, refused = _step(pair, None) if paired else (None, ())
+    stereo, refused = _step(pair, None) if paired else (None, ())
     if paired:
-        told(None, "stereo")
+        report_step(None, "stereo")
     result = FitResult(
         source=recordings.source,
         cameras=cameras,
-        stereo=found,
-        skipped=(*(skipped for one in fitted.values() for skipped in one.skipped), *refused),
+        stereo=stereo,
+        skipped=(*(skipped for side_fit in fitted.values() for skipped in side_fit.skipped), *refused),
     )
     squares_mm = [capture.square_mm for capture in recordings.captures(CharucoCapture)]
     warnings = implausible_figures(result, recordings.manifest.cameras, squares_mm)
     return result.model_copy(update={"warnings": warnings})
 
 
-def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told: Callable[[Step], None]) -> SideFit:
-    """Run the fits of `steps` of one side. Geometry runs in a thread of its own. `told` is called with each step that
-    was done.
+def fit_side(
+    recordings: RecordingSet, side: Side, steps: Collection[Step], report_step: Callable[[Step], None]
+) -> SideFit:
+    """Run the fits of `steps` of one side. Geometry runs in a thread of its own. `report_step` is called with each step
+    that was done.
     """
     from lab.fit.geometry import fit_geometry
     from lab.fit.mtf import fit_mtf
@@ -115,7 +117,7 @@ def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told
             return None
         result, refused = _step(work, side)
         skipped.extend(refused)
-        told(name)
+        report_step(name)
         return result
 
     def fit_geometry_of_side() -> GeometryFit | None:

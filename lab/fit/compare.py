@@ -98,23 +98,34 @@ class ComparedNumbers:
 
         The conversion's part is a share of the larger of both, so that it is as wide for a fall as for a rise.
         """
-        found, share = self, 0.0
+        scaled, share = self, 0.0
         if self.sensor is not None and reference.sensor is not None:
             doublings, std = self.sensor.doublings(reference.sensor)
             factor, share = 2.0**doublings, float(np.log(2.0)) * std
-            found = replace(self, value=factor * self.value, std=factor * self.std, sensor=reference.sensor)
-        larger = np.maximum(np.abs(found.value), np.abs(reference.value))
+            scaled = replace(self, value=factor * self.value, std=factor * self.std, sensor=reference.sensor)
+        larger = np.maximum(np.abs(scaled.value), np.abs(reference.value))
         drift = np.sqrt(2.0) * LAMP_DRIFT_PERCENT.get(self.name.rpartition(" ")[2], 0.0)
-        return found, np.sqrt(found.std**2 + reference.std**2 + (share * larger) ** 2 + drift**2)
+        return scaled, np.sqrt(scaled.std**2 + reference.std**2 + (share * larger) ** 2 + drift**2)
 
 
 def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RATE) -> ComparisonResult:
     """Compare two fits of one rig, number by number.
 
-    `false_alarm_rate`: probability of any `changed` between two calibrations of an unchanged rig. It is shared among
-    the n rows of the comparison (Sidak): each is `changed` beyond z sigma with 2 (1 - Phi(z)) = 1 - (1 - rate)^(1/n),
-    4.1 for the 239 rows of a session with eight edges, 4.4 for 1000. Rows are taken as independent. They are not; the
-    true rate is lower. `tests/recovery/test_compare_coverage.py` measures it on 105 comparisons of an unchanged camera.
+    a, b : the fits
+    false_alarm_rate : probability of any `changed` between two calibrations of an unchanged rig
+
+    The rate is shared among the n rows of the comparison (Sidak): each is `changed` beyond z sigma with
+    2 (1 - Phi(z)) = 1 - (1 - rate)^(1/n), 4.1 for the 239 rows of a session with eight edges, 4.4 for 1000. Rows are
+    taken as independent. They are not; the true rate is lower. `tests/recovery/test_compare_coverage.py` measures it on
+    105 comparisons of an unchanged camera.
+
+    >>> from lab.formats.results import CameraFit, NoiseFit
+    >>> def fitted(read_noise_e):
+    ...     noise = NoiseFit(read_noise_e=read_noise_e, read_noise_e_std=0.05)
+    ...     return FitResult(source="my-camera", cameras={"left": CameraFit(noise=noise)})
+    >>> change = compare(fitted(2.0), fitted(3.0)).changes[0]
+    >>> round(change.significance_sigma, 1), change.changed  # 1 / (0.05 sqrt(2))
+    (14.1, True)
     """
     skipped: list[Skipped] = []
     rows: list[Change] = []
@@ -124,21 +135,25 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
             only = "A" if side in a.cameras else "B"
             skipped.append(Skipped(step="camera", reason=f"only {only} has this side", side=side))
             continue
-        one, two = a.cameras[side], b.cameras[side]
-        skipped += _without_temperature(one, two, side)
-        numbers_a, numbers_b = dict(numbers_of(one, "")), dict(numbers_of(two, ""))
-        if one.spectral and two.spectral and one.spectral.wavelength_nm != two.spectral.wavelength_nm:
+        camera_a, camera_b = a.cameras[side], b.cameras[side]
+        skipped += _without_temperature(camera_a, camera_b, side)
+        numbers_a, numbers_b = dict(numbers_of(camera_a, "")), dict(numbers_of(camera_b, ""))
+        if (
+            camera_a.spectral
+            and camera_b.spectral
+            and camera_a.spectral.wavelength_nm != camera_b.spectral.wavelength_nm
+        ):
             numbers_a = {name: of for name, of in numbers_a.items() if INTEGRAL not in name}
             numbers_b = {name: of for name, of in numbers_b.items() if INTEGRAL not in name}
             reason = "the curves of A and B end at different wavelengths: their integrals aren't of one band"
             skipped.append(Skipped(step="integrated quantum efficiency", reason=reason, side=side))
         rows += _compare_numbers(numbers_a, numbers_b, side, skipped)
-        if one.geometry is not None and two.geometry is not None:
-            found = _projection(one.geometry, two.geometry, side)
-            if isinstance(found, Skipped):
-                skipped.append(found)
+        if camera_a.geometry is not None and camera_b.geometry is not None:
+            change = _projection(camera_a.geometry, camera_b.geometry, side)
+            if isinstance(change, Skipped):
+                skipped.append(change)
             else:
-                projections.append(found)
+                projections.append(change)
     if a.stereo is not None and b.stereo is not None:
         rows += _compare_numbers(
             dict(numbers_of(a.stereo, "stereo ")), dict(numbers_of(b.stereo, "stereo ")), None, skipped
@@ -181,12 +196,26 @@ def _without_temperature(a: CameraFit, b: CameraFit, side: Side) -> Iterator[Ski
 
 
 def sigma_of_probability(p_value: float) -> float:
-    """Express a probability as standard deviations of a normal distribution, two-sided."""
+    """Express a probability as standard deviations of a normal distribution, two-sided.
+
+    p_value : probability, 0..1
+
+    >>> round(sigma_of_probability(0.0027), 2)
+    3.0
+    """
     return -float(special.ndtri(max(p_value, 1e-300) / 2.0))
 
 
 def sidak_part(rate: float, number: int) -> float:
-    """Return the probability allowed for each of `number` tests, so that any of them has `rate` (Sidak)."""
+    """Return the probability allowed for each of `number` independent tests, so that any of them has `rate` (Sidak).
+
+    rate : probability that one or more of the tests fail by chance, 0..1
+    number : how many tests
+
+    >>> each = sidak_part(0.01, 200)
+    >>> round(1.0 - (1.0 - each) ** 200, 6)
+    0.01
+    """
     return float(-np.expm1(np.log1p(-rate) / max(number, 1)))
 
 
@@ -271,11 +300,13 @@ def _compare_numbers(
             skipped.append(Skipped(step="numbers", reason=f"only {which} has {shown}", side=side))
     for name, numbers in a.items():
         if name in b:
-            one, two = _align(numbers, b[name])
-            if one.value.shape != two.value.shape:
-                skipped.append(Skipped(step=name, reason=f"A has {one.value.shape}, B {two.value.shape}", side=side))
+            numbers_a, numbers_b = _align(numbers, b[name])
+            if numbers_a.value.shape != numbers_b.value.shape:
+                skipped.append(
+                    Skipped(step=name, reason=f"A has {numbers_a.value.shape}, B {numbers_b.value.shape}", side=side)
+                )
             else:
-                yield from _rows(one, two, side)
+                yield from _rows(numbers_a, numbers_b, side)
 
 
 def _align(a: ComparedNumbers, b: ComparedNumbers) -> tuple[ComparedNumbers, ComparedNumbers]:
@@ -361,11 +392,11 @@ def _covariance(fit: GeometryFit) -> Array | None:
     """Return the covariance (12, 12) of the intrinsics, or None where the fit doesn't state it."""
     if fit.covariance is None:
         return None
-    found = np.zeros((COUNT, COUNT))
+    covariance = np.zeros((COUNT, COUNT))
     names = CameraGeometry.of_fit(fit).projection.names
     at = [names.index(name) for name in fit.parameters if name in names]
-    found[np.ix_(at, at)] = np.array(fit.covariance)[: len(at), : len(at)]
-    return found
+    covariance[np.ix_(at, at)] = np.array(fit.covariance)[: len(at), : len(at)]
+    return covariance
 
 
 def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange | Skipped:
@@ -379,9 +410,9 @@ def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange 
         )
     # Corners of both calibrations in the frame of the first camera
     places = [seen_points(a)]
-    other = seen_points(b)
-    if len(other):
-        points = first.at_depth(second.project(other), other[:, 2])
+    corners_of_b = seen_points(b)
+    if len(corners_of_b):
+        points = first.at_depth(second.project(corners_of_b), corners_of_b[:, 2])
         places.append(points[np.isfinite(points).all(axis=1)])
     gauge = np.concatenate(places)
     if len(gauge) < MIN_SEEN:
@@ -389,7 +420,7 @@ def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange 
             step="projection", reason=f"{len(gauge)} corners are stated, {MIN_SEEN} needed: fit again", side=side
         )
     rotation, shift = implied_motion(first, second, gauge)
-    found = difference(first, second, (of_a, of_b), gauge, gauge)
+    change = difference(first, second, (of_a, of_b), gauge, gauge)
     stated = second.project(gauge) - first.project(gauge)
     x, y = grid(_frame(a, b))
     points = first.at_depth(grid_points(x, y), float(np.median(gauge[:, 2])))
@@ -399,9 +430,9 @@ def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange 
         as_stated_px=float(np.sqrt(np.mean(np.sum(stated**2, axis=1)))),
         implied_turn_mrad=(1e3 * Rotation.from_matrix(rotation).as_rotvec()).tolist(),
         implied_shift_mm=shift.tolist(),
-        difference_px=found.rms_px,
-        expected_px=found.expected_px,
-        significance_sigma=found.significance_sigma,
+        difference_px=change.rms_px,
+        expected_px=change.expected_px,
+        significance_sigma=change.significance_sigma,
         changed=False,
         x_px=tuple(map(float, x)),
         y_px=tuple(map(float, y)),
@@ -460,17 +491,17 @@ class FailRule:
     def parse(cls, text: str) -> FailRule:
         """Parse a rule. Raises InputError where the text states none."""
         refused = InputError(f"--fail-on {text!r}: give FIGURE, or FIGURE>AMOUNT with an optional %, SIDE: before it")
-        found = _RULE.fullmatch(text.strip())
-        if found is None:
+        rule = _RULE.fullmatch(text.strip())
+        if rule is None:
             raise refused
         try:
-            amount = float(found["amount"] or 0.0)
+            amount = float(rule["amount"] or 0.0)
         except ValueError:
             raise refused from None
         if not 0.0 <= amount < float("inf"):
             raise refused
-        relative = found["percent"] is not None
-        return cls(found["figure"].strip(), found["side"], amount / 100.0 if relative else amount, relative)
+        relative = rule["percent"] is not None
+        return cls(rule["figure"].strip(), rule["side"], amount / 100.0 if relative else amount, relative)
 
     def _names(self, name: str, side: str | None) -> bool:
         """Tell whether the rule names a figure of a side."""

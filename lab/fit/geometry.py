@@ -77,21 +77,21 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
     jacobian = by_camera @ parameters
     farthest = float(np.linalg.norm(seen - intrinsics[2:4], axis=1).max())
     radius = np.linspace(0.0, farthest, 16)
-    found = []
+    channels = []
     for channel in corners[0]:
         trusted = np.concatenate([fits[channel].trusted & fits["G"].trusted for fits in corners])
         at = np.concatenate([fits[channel].points for fits in corners])
         green = np.concatenate([fits["G"].points for fits in corners])
         if trusted.sum() < 4 * MIN_CORNERS:
             continue
-        own = fit_shift((at - seen)[trusted], jacobian[trusted])
-        near = own.away_std < OUTLYING_CORNER_STD
-        theta = CameraGeometry(camera.projection, intrinsics + parameters @ own.values)
+        shift_of_channel = fit_shift((at - seen)[trusted], jacobian[trusted])
+        near = shift_of_channel.away_std < OUTLYING_CORNER_STD
+        theta = CameraGeometry(camera.projection, intrinsics + parameters @ shift_of_channel.values)
         result = ChannelGeometry(
             channel=channel,
             camera_matrix=theta.matrix.tolist(),
             distortion=theta.distortion.tolist(),
-            rms_px=own.std_px * float(np.sqrt(np.mean(own.away_std[near] ** 2))),
+            rms_px=shift_of_channel.std_px * float(np.sqrt(np.mean(shift_of_channel.away_std[near] ** 2))),
             corners=int(near.sum()),
         )
         if channel != "G":
@@ -113,8 +113,8 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
                     ),
                 }
             )
-        found.append(result)
-    return tuple(found)
+        channels.append(result)
+    return tuple(channels)
 
 
 def _colour_parameters(intrinsics: Array) -> Array:
@@ -138,13 +138,13 @@ def fit_geometry(recordings: RecordingSet, side: Side) -> GeometryFit:
     )
     channels: tuple[ChannelGeometry, ...] = ()
     if cfa != "MONO":
-        found = boards.by_capture()
+        corners_of_capture = boards.by_capture()
         corners = []
         for view in calibration.views:
-            whole = found[view.capture.id]
+            whole = corners_of_capture[view.capture.id]
             fits = channel_corners(plane_corners(recordings, whole), cfa)
             kept = np.isin(whole.index, view.index)
-            corners.append({channel: one.only(kept) for channel, one in fits.items()})
+            corners.append({channel: fit.only(kept) for channel, fit in fits.items()})
         channels = channel_geometry(calibration, corners)
     return geometry_result(calibration, boards.missed, channels)
 
@@ -215,16 +215,16 @@ def projection_maps(calibration: Calibration) -> tuple[ProjectionUncertainty, ..
     x, y = grid(calibration.shape)
     image = grid_points(x, y)
     distances = (float(np.median(np.linalg.norm(calibration.points, axis=1))), None)
-    found = []
+    maps = []
     for distance_mm in distances:
         std = calibration.projection_std(image, distance_mm).reshape(len(y), len(x))
         if not np.isfinite(std).all():  # where the distortion has no inverse
             std = np.where(np.isfinite(std), std, np.nanmax(std))
         rows = tuple(tuple(row.tolist()) for row in std)
-        found.append(
+        maps.append(
             ProjectionUncertainty(distance_mm=distance_mm, x_px=x.tolist(), y_px=y.tolist(), projection_px_std=rows)
         )
-    return tuple(found)
+    return tuple(maps)
 
 
 def board_warps(views: Sequence[BoardView], warps_mm: Array, covariance: Array) -> tuple[BoardWarp, ...]:
@@ -232,7 +232,7 @@ def board_warps(views: Sequence[BoardView], warps_mm: Array, covariance: Array) 
     them.
     """
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(-1, 3)
-    found = []
+    warps = []
     for number, view in enumerate(first_view_of_boards(views)):
         capture = view.capture
         known = std[number] < LARGEST_WARP_STD * warp_prior_mm(view)
@@ -241,17 +241,17 @@ def board_warps(views: Sequence[BoardView], warps_mm: Array, covariance: Array) 
             fields[field] = float(warps_mm[number, k]) if known[k] else None
             fields[f"{field}_std"] = float(std[number, k]) if known[k] else None
         name = f"{capture.squares[0]} x {capture.squares[1]} squares of {capture.square_mm:g} mm, {capture.dictionary}"
-        found.append(BoardWarp(board=name, **fields))
-    return tuple(found)
+        warps.append(BoardWarp(board=name, **fields))
+    return tuple(warps)
 
 
 def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:
     """List where the corners of each view were seen, and their distances from the predictions."""
     state = calibration.solution.state
-    found = []
+    views = []
     for k, (view, rest) in enumerate(zip(calibration.views, calibration.solution.residuals, strict=True)):
         depth = (view.board_mm @ state.rotations[k].T + state.translations_mm[k])[:, 2]
-        found.append(
+        views.append(
             ViewResiduals(
                 capture=view.capture.id,
                 corner=tuple(int(index) for index in view.index),
@@ -263,7 +263,7 @@ def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:
                 noise_px=None if view.std_px is None else float(np.sqrt(np.mean(view.std_px**2))),
             )
         )
-    return tuple(found)
+    return tuple(views)
 
 
 def _projection_remarks(calibration: Calibration) -> list[str]:

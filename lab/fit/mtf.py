@@ -60,12 +60,12 @@ def fit_mtf(
     reasons: list[str] = [] if left_out is None else left_out
     for capture in captures:
         try:
-            found = () if capture.region else edges_of(recordings, capture)
+            edges = () if capture.region else edges_of(recordings, capture)
         except NotDetermined as refused:
             reasons.append(f"{capture.id}: {refused.reason}")
             continue
-        reasons += [f"{capture.id}: {f.refused}" for f in found if f.refused]
-        regions = [capture.region] if capture.region else [f.region for f in found if not f.refused]
+        reasons += [f"{capture.id}: {f.refused}" for f in edges if f.refused]
+        regions = [capture.region] if capture.region else [f.region for f in edges if not f.refused]
         for region, channel in itertools.product(regions, ("Y",) if camera.cfa == "MONO" else ("R", "G", "B")):
             try:
                 edge = read_mtf(measure_edge(recordings, [capture], channel, noise, region))

@@ -128,7 +128,10 @@ def _shifted_pose(
     """
     for later, name in ((1, "next"), (-1, "previous")):
         of_left, of_right = (pairs[:-1], pairs[1:]) if later > 0 else (pairs[1:], pairs[:-1])
-        moved = [StereoPair(one.left, other.right) for one, other in zip(of_left, of_right, strict=True)]
+        moved = [
+            StereoPair(left_pair.left, right_pair.right)
+            for left_pair, right_pair in zip(of_left, of_right, strict=True)
+        ]
         if len(moved) <= MIN_PAIRS:
             continue
         try:
@@ -143,15 +146,15 @@ def _shifted_pose(
 def fitted_views(recordings: RecordingSet, side: Side, fit: GeometryFit) -> list[BoardView]:
     """Return the views that the fit of a camera rests on, without the corners that it left out."""
     views = board_corners(recordings, side).by_capture()
-    found = []
-    for one in fit.residuals:
-        view = views.get(one.capture)
+    views_used = []
+    for residuals in fit.residuals:
+        view = views.get(residuals.capture)
         if view is None:
             raise NotDetermined(
-                "stereo", f"the {side} geometry rests on '{one.capture}', which isn't here: fit it again"
+                "stereo", f"the {side} geometry rests on '{residuals.capture}', which isn't here: fit it again"
             )
-        found.append(view.only(np.isin(view.index, one.corner)))
-    return found
+        views_used.append(view.only(np.isin(view.index, residuals.corner)))
+    return views_used
 
 
 def free_of(fit: GeometryFit) -> NDArray[np.bool_]:
@@ -179,12 +182,12 @@ def _split_by_numbering(
         )
         turns.append(of_right * of_left.inv())
         reversed_turns.append(of_right * half_turn * of_left.inv())
-    apart = np.array([[(one.inv() * two).magnitude() for one in turns] for two in turns])
+    apart = np.array([[(turn_a.inv() * turn_b).magnitude() for turn_a in turns] for turn_b in turns])
     typical = turns[int(np.argmin(apart.sum(axis=1)))]  # the one nearest to all others
     kept: list[StereoPair] = []
     rejected: list[Skipped] = []
     for pair, turn, reverse in zip(pairs, turns, reversed_turns, strict=True):
-        off, off_reversed = (float(np.rad2deg((typical.inv() * one).magnitude())) for one in (turn, reverse))
+        off, off_reversed = (float(np.rad2deg((typical.inv() * rotation).magnitude())) for rotation in (turn, reverse))
         if len(pairs) == MIN_PAIRS or off < 90.0 or off_reversed > REVERSED_DEG:
             kept.append(pair)
             continue
@@ -200,11 +203,11 @@ def _split_by_numbering(
 def rig_observations(pairs: Sequence[StereoPair]) -> list[Observation]:
     """Make the observations of a rig, pair by pair, left then right; pairs of equal boards share the board."""
     keys = list(dict.fromkeys(board_key(pair.left) for pair in pairs))
-    found = []
+    observations = []
     for k, pair in enumerate(pairs):
         board = keys.index(board_key(pair.left))
-        found += [Observation(pair.left, k, board, 0), Observation(pair.right, k, board, 1)]
-    return found
+        observations += [Observation(pair.left, k, board, 0), Observation(pair.right, k, board, 1)]
+    return observations
 
 
 def solve_rig(pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit, shape: tuple[int, int]) -> Solution:
@@ -223,7 +226,7 @@ def solve_rig(pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit
         intrinsics=np.array([camera.intrinsics for camera in cameras]),
         rotation=rotation,
         translation_mm=translation_mm,
-        warps_mm=np.zeros((1 + max(one.board for one in observations), 3)),
+        warps_mm=np.zeros((1 + max(observation.board for observation in observations), 3)),
         rotations=poses.rotations,
         translations_mm=poses.translations_mm,
     )
@@ -300,11 +303,11 @@ def rectification(state: RigParameters, pairs: Sequence[StereoPair], shape: tupl
         distortions, alpha = [camera.distortion for camera in cameras], 0.0
     else:  # OpenCV knows only Brown's distortion; the rectified pair then has the scale of the cameras' axes
         distortions, alpha = [np.zeros(5)] * 2, -1.0
-    found = cv2.stereoRectify(
+    rectified = cv2.stereoRectify(
         cameras[0].matrix, distortions[0], cameras[1].matrix, distortions[1],
         shape[::-1], state.rotation, state.translation_mm[:, None], alpha=alpha,
     )  # fmt: skip
-    rotation_one, rotation_two, new_one, new_two, to_depth = found[:5]
+    rotation_one, rotation_two, new_one, new_two, to_depth = rectified[:5]
     gaps = []
     for pair in pairs:
         at_left, at_right = pair.common
@@ -348,21 +351,21 @@ def rectification_maps(stereo: StereoFit, shape: tuple[int, int]) -> dict[Side, 
     """
     if stereo.rectification is None or stereo.camera_matrix_left is None or stereo.camera_matrix_right is None:
         raise NotDetermined("rectification", "the stereo fit has none: fit again cameras of equal size")
-    own = stereo.rectification
+    rectified = stereo.rectification
     left, right = _cameras_of(stereo)
     x, y = np.meshgrid(np.arange(shape[1], dtype=float), np.arange(shape[0], dtype=float))
-    found: dict[Side, tuple[Array, Array]] = {}
+    maps: dict[Side, tuple[Array, Array]] = {}
     sides: tuple[tuple[Side, CameraGeometry, Any, Any], ...] = (
-        ("left", left, own.rotation_left, own.projection_left),
-        ("right", right, own.rotation_right, own.projection_right),
+        ("left", left, rectified.rotation_left, rectified.projection_left),
+        ("right", right, rectified.rotation_right, rectified.projection_right),
     )
     for side, camera, turn, new in sides:
         pixels = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)])
         rays = pixels @ np.linalg.inv(np.array(new)[:, :3]).T @ np.array(turn)
         seen = camera.project(rays).astype(np.float32)
         seen[~camera.projection.sees(rays)] = -1.0  # outside of the frame
-        found[side] = seen[:, 0].reshape(shape), seen[:, 1].reshape(shape)
-    return found
+        maps[side] = seen[:, 0].reshape(shape), seen[:, 1].reshape(shape)
+    return maps
 
 
 def _cameras_of(stereo: StereoFit) -> tuple[CameraGeometry, CameraGeometry]:

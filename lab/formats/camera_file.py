@@ -102,16 +102,16 @@ def read_camera(
     if isinstance(values.get("lens"), dict) and isinstance(values["lens"].get("imaging"), dict):
         imaging, prescription = _imaging(file, values["lens"]["imaging"], cache, progress, sent)
         values["lens"] = values["lens"] | {"imaging": imaging}
-    camera = _validated(file, "", CameraModel, values)
+    camera = _validate(file, "", CameraModel, values)
     _check_levels(file, camera)
     acting = content.get("effects", [])
-    if not isinstance(acting, list) or not all(isinstance(one, dict) for one in acting):
+    if not isinstance(acting, list) or not all(isinstance(entry, dict) for entry in acting):
         raise InputError(f"{file}: effects is {acting!r}, not a list of tables; write [[effects]] above each")
     name = content.get("name", file.stem)
     if not isinstance(name, str):
         raise InputError(f"{file}: name is {name!r}, not text; put it into quotes")
     posterior = _posterior(file, content["posterior"], sent) if "posterior" in content else None
-    effects_of = tuple(_effect(file, k, one) for k, one in enumerate(acting))
+    effects_of = tuple(_effect(file, k, entry) for k, entry in enumerate(acting))
     return CameraFile(name, camera, effects_of, prescription, posterior)
 
 
@@ -125,10 +125,10 @@ def _posterior(file: Path, given: Any, sent: bool) -> ModelPosterior:
 def _beside(file: Path, key: str, path: str, sent: bool) -> Path:
     """Return a file that a camera file names. Raises InputError where it lies outside the folder of one that was
     sent."""
-    found = file.parent / path
-    if sent and ("\0" in path or not found.resolve().is_relative_to(file.parent.resolve())):
+    path_of_file = file.parent / path
+    if sent and ("\0" in path or not path_of_file.resolve().is_relative_to(file.parent.resolve())):
         raise InputError(f"{file}: {key}: {path[:80]!r} leaves the folder; put the file beside the camera file")
-    return found
+    return path_of_file
 
 
 def _curve(file: Path, key: str, given: Any, sent: bool) -> Any:
@@ -170,7 +170,7 @@ def _imaging(
         try:
             if which == "table":
                 return {"kind": "traced_lens", "table": LensTable.load(beside)}, None
-            return {"kind": "traced_lens", "table": traced_table(beside, cache, progress)}, beside
+            return {"kind": "traced_lens", "table": trace_table(beside, cache, progress)}, beside
         except (ValueError, InputError) as error:
             raise InputError(f"{file}: {key}.{which}: {_first(error)}") from error
     if "samples" not in values:
@@ -191,7 +191,15 @@ def _imaging(
 
 
 def lens_cache() -> Path:
-    """Folder where traced lenses' tables are kept: CALIBENCH_CACHE, else the platform's own place for such files."""
+    """Return the folder where traced lenses' tables are kept: CALIBENCH_CACHE, else the platform's own place for such
+    files.
+
+    >>> import os
+    >>> os.environ["CALIBENCH_CACHE"] = "/data/lenses"
+    >>> lens_cache()
+    PosixPath('/data/lenses')
+    >>> del os.environ["CALIBENCH_CACHE"]
+    """
     if "CALIBENCH_CACHE" in os.environ:
         return Path(os.environ["CALIBENCH_CACHE"])
     if sys.platform == "win32":
@@ -201,7 +209,7 @@ def lens_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "calibench"
 
 
-def traced_table(
+def trace_table(
     prescription: Path, cache: Path | None = None, progress: Callable[[str, float], None] | None = None
 ) -> LensTable:
     """Return the table of a lens from its prescription, from the folder `cache` (None: `lens_cache`) or traced and kept
@@ -223,7 +231,7 @@ def traced_table(
         ) from error
 
 
-def _validated(file: Path, at: str, model: type[BaseModel], values: Mapping[str, Any]) -> Any:
+def _validate(file: Path, at: str, model: type[BaseModel], values: Mapping[str, Any]) -> Any:
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -233,7 +241,7 @@ def _validated(file: Path, at: str, model: type[BaseModel], values: Mapping[str,
         if problem["type"] == "extra_forbidden":
             what = (
                 f"{key} isn't a key of a camera file; leave it out, or take one of "
-                f"{', '.join(_known(model, where[:-1]))}"
+                f"{', '.join(_keys_of_table(model, where[:-1]))}"
             )
         elif problem["type"] == "missing":
             meant = read_quantities(model).get(where[-1])
@@ -241,12 +249,12 @@ def _validated(file: Path, at: str, model: type[BaseModel], values: Mapping[str,
         else:
             value = repr(problem["input"])
             shown = "" if len(value) > 60 or value in problem["msg"] else f" is {value}"
-            told = problem["msg"].removeprefix("Value error, ")
-            what = f"{key}{shown}: {told}" + ("" if "; " in told else "; correct it")
+            message = problem["msg"].removeprefix("Value error, ")
+            what = f"{key}{shown}: {message}" + ("" if "; " in message else "; correct it")
         raise InputError(f"{file}: {' '.join(what.split())}") from error
 
 
-def _known(model: type[BaseModel], where: Sequence[str]) -> list[str]:
+def _keys_of_table(model: type[BaseModel], where: Sequence[str]) -> list[str]:
     """Return the keys that the table `where` may have."""
     if where[:1] == ["lens"]:
         return (
@@ -262,8 +270,8 @@ def _effect(file: Path, index: int, given: Mapping[str, Any]) -> Effect:
     name = given.get("name")
     if not isinstance(name, str) or name not in effects():
         raise InputError(f"{file}: {at}.name is {name!r}, which isn't an effect; take one of {', '.join(effects())}")
-    found: Effect = _validated(file, at, effect(name), {key: value for key, value in given.items() if key != "name"})
-    return found
+    acting: Effect = _validate(file, at, effect(name), {key: value for key, value in given.items() if key != "name"})
+    return acting
 
 
 def _check_levels(file: Path, camera: CameraModel) -> None:
@@ -303,8 +311,18 @@ def _first(error: Exception) -> str:
 def write_camera(file: Path, content: CameraFile) -> None:
     """Write a camera file that `read_camera` reads back to exactly the same camera.
 
+    file : TOML, to be written
+    content : the camera, its effects and its lens
+
     Measured point-spread and transfer functions go into an .npz file beside it; so does the table of a traced lens
     without a prescription.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "left.toml"
+    ...     write_camera(file, default_camera())
+    ...     read_camera(file).camera == default_camera().camera
+    True
     """
     text = "\n".join(_lines(file, content)) + "\n"
     with replacing(file) as partial:
@@ -360,11 +378,11 @@ def _lines(file: Path, content: CameraFile) -> Iterator[str]:
         yield ""
         yield "[std]  # one standard uncertainty of the parameter of that name, in its unit"
         yield from (f"{key} = {_text(value)}" for key, value in camera.std.items())
-    for one in content.effects:
+    for acting in content.effects:
         yield ""
-        yield f"[[effects]]  # {one.sentence}"
-        yield f"name = {_text(one.name)}"
-        yield from _parameters(one)
+        yield f"[[effects]]  # {acting.sentence}"
+        yield f"name = {_text(acting.name)}"
+        yield from _parameters(acting)
 
 
 def _imaging_lines(file: Path, content: CameraFile) -> Iterator[str]:
@@ -401,12 +419,16 @@ def _parameters(model: BaseModel, skip: Sequence[str] = ()) -> Iterator[str]:
         if key in skip:
             continue
         value = getattr(model, key)
-        comment = f"  # {said_of(known[key])}" if key in known else ""
+        comment = f"  # {describe_quantity(known[key])}" if key in known else ""
         yield f"# {key} is not set{comment}" if value is None else f"{key} = {_text(value)}{comment}"
 
 
-def said_of(quantity: Quantity) -> str:
-    """Unit, meaning and bounds of a parameter, as they stand in the file's comments and in the documentation."""
+def describe_quantity(quantity: Quantity) -> str:
+    """Return unit, meaning and bounds of a parameter, as they stand in the file's comments and in the documentation.
+
+    >>> describe_quantity(read_quantities(CameraModel)["read_noise_e"]).startswith("e")
+    True
+    """
     bounds = ["" if limit is None else f"{limit:g}" for limit in (quantity.lower, quantity.upper)]
     limits = f" ({bounds[0]} .. {bounds[1]})".replace("( ..", "(..").replace(".. )", "..)") if any(bounds) else ""
     return f"{quantity.unit}: {quantity.meaning}{limits}"
@@ -443,6 +465,11 @@ def default_camera() -> CameraFile:
 
     Its values are like those of data sheets of 1/3 inch sensors. Its curves, with an infrared-cut filter at 650 nm,
     have typical shapes and are of no particular maker.
+
+    >>> import calibench
+    >>> camera = calibench.default_camera().camera
+    >>> camera.rows, camera.cols, camera.cfa, camera.bit_depth
+    (960, 1280, 'RGGB', 12)
     """
     wavelength_nm = np.arange(380.0, 721.0, 10.0)
 

@@ -9,7 +9,7 @@ import numpy as np
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import CameraFit
 from lab.formats.results.plausible import FIGURES
-from lab.formats.results.words import measured, unit_of
+from lab.formats.results.words import format_value, unit_of
 from sim.camera import CameraModel, Geometry, Lens, Side
 from sim.spectrum import Spectrum
 
@@ -87,23 +87,23 @@ def camera_model(
 
 def assumptions(camera: DataSheet, fit: CameraFit | None = None) -> tuple[Assumed, ...]:
     """Return the quantities for which `camera_model` takes typical values, given this data sheet and fit."""
-    found = []
+    assumed = []
     if camera.f_number is None:
-        found.append(Assumed("f_number", "8"))
+        assumed.append(Assumed("f_number", "8"))
     if camera.focal_length_mm is None:
-        found.append(Assumed("focal_length_mm", "no fall-off of the light"))
+        assumed.append(Assumed("focal_length_mm", "no fall-off of the light"))
     if camera.lens_transmittance is None:
-        found.append(Assumed("lens_transmittance", "1"))
+        assumed.append(Assumed("lens_transmittance", "1"))
     if camera.pixel_pitch_um is None:
-        found.append(Assumed("pixel_pitch_um", f"{USUAL_PITCH_UM:g}"))
+        assumed.append(Assumed("pixel_pitch_um", f"{USUAL_PITCH_UM:g}"))
     if camera.fill_factor is None:
-        found.append(Assumed("fill_factor", "1"))
+        assumed.append(Assumed("fill_factor", "1"))
     unknown = set(camera.channels) - set(camera.quantum_efficiency or {})
     if fit is not None and fit.spectral is not None:
         unknown -= set(fit.spectral.quantum_efficiency)
     if unknown:
-        found.append(Assumed("quantum_efficiency", f"typical curves{_how_scaled(fit)}"))
-    return tuple(found)
+        assumed.append(Assumed("quantum_efficiency", f"typical curves{_how_scaled(fit)}"))
+    return tuple(assumed)
 
 
 def _how_scaled(fit: CameraFit | None) -> str:
@@ -112,12 +112,12 @@ def _how_scaled(fit: CameraFit | None) -> str:
     if noise is None or noise.quantum_efficiency is None:
         return ""
     nm = noise.quantum_efficiency_wavelength_nm
-    found = measured(noise.quantum_efficiency, noise.quantum_efficiency_std)
+    measured = format_value(noise.quantum_efficiency, noise.quantum_efficiency_std)
     if nm is None:
-        return f" (the measured {found} isn't used: the wavelength of its light isn't stated)"
+        return f" (the measured {measured} isn't used: the wavelength of its light isn't stated)"
     at_nm = _measured_efficiency(fit)
     if at_nm is None:
-        return f" (the measured {found} at {nm:g} nm isn't used: it is beyond 0..1)"
+        return f" (the measured {measured} at {nm:g} nm isn't used: it is beyond 0..1)"
     limited = ", limited to 1" if _peak_level(*at_nm) > 1.0 or at_nm[1] != noise.quantum_efficiency else ""
     return f", scaled to {at_nm[1]:.4g} as measured at {nm:g} nm{limited}"
 
@@ -147,31 +147,31 @@ def assumed_noise(camera: DataSheet, fit: CameraFit | None, model: CameraModel) 
 def limited_values(fit: CameraFit | None) -> tuple[str, ...]:
     """Return a line for each fitted value that a camera can't have and `camera_model` therefore changes, or that
     `read_camera` refuses."""
-    found = []
+    remarks = []
     noise, spectral = (fit.noise, fit.spectral) if fit is not None else (None, None)
     for name in ("black_level_dn", "dark_current_e_per_s"):
         value = getattr(noise, name, None)
         if value is not None and value < 0.0:
-            text = measured(value, getattr(noise, f"{name}_std"), unit_of(name))
-            found.append(f"{name}: the fitted {text} is below the limit of 0; written as 0")
+            text = format_value(value, getattr(noise, f"{name}_std"), unit_of(name))
+            remarks.append(f"{name}: the fitted {text} is below the limit of 0; written as 0")
     for channel, curve in (spectral.quantum_efficiency if spectral is not None else {}).items():
         if (below := sum(value < 0.0 for value in curve)) > 0:
-            found.append(
+            remarks.append(
                 f"quantum_efficiency.{channel}: {below} of {len(curve)} fitted values are below the limit of 0, down "
                 f"to {min(curve):.2g}; written as 0"
             )
         if max(curve) > 1.0:
-            found.append(
+            remarks.append(
                 f"quantum_efficiency.{channel}: fitted values up to {max(curve):.4g} are above the limit of 1 electron "
                 "a photon; a camera file with them is refused: correct the stated light and fit again"
             )
-    return tuple(found)
+    return tuple(remarks)
 
 
 def remarks_on_values(camera: DataSheet, fit: CameraFit | None, model: CameraModel) -> tuple[str, ...]:
     """Return a line for each value of a model that nobody stated or fitted, and for each that isn't the fitted one."""
     assumed = (*assumptions(camera, fit), *assumed_noise(camera, fit, model))
-    taken = (f"{one.quantity}: neither fitted nor stated; taken as {one.value}" for one in assumed)
+    taken = (f"{value.quantity}: neither fitted nor stated; taken as {value.value}" for value in assumed)
     return (*taken, *limited_values(fit))
 
 
@@ -188,7 +188,7 @@ def _curves(
         stated = (camera.quantum_efficiency or {}).get(channel)
         if fitted is not None and channel in fitted.quantum_efficiency and not (maker_curves and stated):
             curve = Spectrum.of(fitted.wavelength_nm, np.maximum(fitted.quantum_efficiency[channel], 0.0))
-            curves[channel] = _continued(curve, recordings.spectrum(stated)) if stated else curve
+            curves[channel] = _continue_curve(curve, recordings.spectrum(stated)) if stated else curve
             if channel in fitted.quantum_efficiency_std:
                 spread[channel] = Spectrum.of(fitted.wavelength_nm, fitted.quantum_efficiency_std[channel])
         elif stated:
@@ -221,7 +221,7 @@ def _peak_level(wavelength_nm: float, efficiency: float) -> float:
     return efficiency / float(np.exp(-0.5 * ((wavelength_nm - peak) / width) ** 2))
 
 
-def _continued(fitted: Spectrum, stated: Spectrum) -> Spectrum:
+def _continue_curve(fitted: Spectrum, stated: Spectrum) -> Spectrum:
     """Return a fitted sensitivity, continued beyond the sweep's wavelengths by the maker's curve, scaled to join at
     both ends.
 

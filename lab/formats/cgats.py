@@ -70,9 +70,17 @@ class ForeignText:
 
 
 def read_foreign_text(file: Path) -> ForeignText:
-    """Return the text of `file`: UTF-8, UTF-16 by its byte-order mark or its zeros, else Latin-1 (Windows-1252).
+    r"""Return the text of a file: UTF-8, UTF-16 by its byte-order mark or its zeros, else Latin-1 (Windows-1252).
 
-    Raises InputError, without the path, where the file can't be read or holds no text.
+    Returns the text with remarks on what was converted. Raises InputError, without the path, where the file can't be
+    read or holds no text.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "light.csv"
+    ...     _ = file.write_bytes("wavelength_nm,value\r\n400,0.5\r\n".encode("utf-16"))
+    ...     read_foreign_text(file).text.splitlines()
+    ['wavelength_nm,value', '400,0.5']
     """
     try:
         data = file.read_bytes()
@@ -103,34 +111,48 @@ def remarks_on(folder: Path, names: Iterable[str]) -> list[str]:
     """Return what was found in tables in `folder` beside plain UTF-8 with commas, one line for all that have it in
     common. Those that can't be read have none.
     """
-    found: dict[str, list[Path]] = {}
+    files_of_remark: dict[str, list[Path]] = {}
     for name in names:
         with suppress(InputError):
             for remark in read_foreign_csv(locate(folder, name)).remarks:
-                found.setdefault(remark, []).append(folder / name)
+                files_of_remark.setdefault(remark, []).append(folder / name)
     return [
-        f"{of[0]}{f' and {len(of) - 1} more files' if len(of) > 1 else ''}: {remark}" for remark, of in found.items()
+        f"{of[0]}{f' and {len(of) - 1} more files' if len(of) > 1 else ''}: {remark}"
+        for remark, of in files_of_remark.items()
     ]
 
 
 def read_foreign_csv(file: Path) -> ForeignText:
-    """Return the table in `file` with commas between cells and decimal points, line for line. Raises InputError without
-    the path.
+    r"""Return the table in `file` with commas between cells and decimal points, line for line, and remarks.
+
+    Raises InputError without the path.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "light.csv"
+    ...     _ = file.write_text("wavelength_nm;value\n400;0,5\n")
+    ...     read_foreign_csv(file).text
+    'wavelength_nm,value\n400,0.5\n'
     """
-    found = read_foreign_text(file)
-    text, remarks = plain_csv(found.text)
-    return ForeignText(text, found.remarks + remarks)
+    table = read_foreign_text(file)
+    text, remarks = plain_csv(table.text)
+    return ForeignText(text, table.remarks + remarks)
 
 
 def plain_csv(text: str) -> tuple[str, tuple[str, ...]]:
-    """Return a table with semicolons or tabs as one with commas; decimal commas become points. What has commas in its
-    first line stays as it is.
+    r"""Bring a table with semicolons or tabs to commas between cells and decimal points.
 
-    Raises InputError where numbers of both kinds stand in it, or where a comma may separate decimals or thousands.
+    text : the table; what has commas in its first line stays as it is
+
+    Returns the table and remarks on what was changed. Raises InputError where numbers of both kinds stand in it, or
+    where a comma may separate decimals or thousands.
+
+    >>> plain_csv("wavelength_nm;value\n400;0,5\n")
+    ('wavelength_nm,value\n400,0.5\n', ('read with semicolons between cells and decimal commas',))
     """
     lines = text.splitlines()
     head = next((line for line in lines if line.strip()), "")
-    separator = next((one for one in ";\t" if one in head), None)
+    separator = next((character for character in ";\t" if character in head), None)
     if separator is None or "," in head:
         return text, ()
     try:
@@ -148,17 +170,22 @@ def plain_csv(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def has_decimal_commas(words: Sequence[tuple[int, str]]) -> bool:
-    """Return whether the numbers among the words of a table, each with its row, have decimal commas.
+    """Return whether the numbers of a table have decimal commas.
+
+    words : (row, word) of each word of the table
 
     Raises InputError where numbers of both kinds stand in it, or where a comma may separate decimals or thousands.
+
+    >>> has_decimal_commas([(2, "400"), (2, "0,5")])
+    True
     """
-    commas = [one for one in words if COMMA_NUMBER.fullmatch(one[1])]
-    points = [one for one in words if POINT_NUMBER.fullmatch(one[1])]
+    commas = [word for word in words if COMMA_NUMBER.fullmatch(word[1])]
+    points = [word for word in words if POINT_NUMBER.fullmatch(word[1])]
     if commas and points:
-        (row, number), (other_row, other) = commas[0], points[0]
+        (row, comma_number), (other_row, point_number) = commas[0], points[0]
         raise InputError(
-            f"row {row} has {number} and row {other_row} has {other}; write all numbers with decimal points, or all "
-            "with commas"
+            f"row {row} has {comma_number} and row {other_row} has {point_number}; write all numbers with decimal "
+            "points, or all with commas"
         )
     if commas and all(THOUSANDS.fullmatch(word) for _, word in commas):
         row, number = commas[0]
@@ -176,21 +203,33 @@ def _with_points(cell: str) -> str:
 
 def nearest_name(name: str, known: Iterable[str]) -> str | None:
     """Return the known name that `name` is probably meant to be: the same with another unit, its beginning, or a
-    misspelling of it. None: there is none.
+    misspelling of it; None where there is none.
+
+    name : as somebody wrote it
+    known : names that there are
+
+    >>> nearest_name("exposure_ms", ["frame", "exposure_s"])
+    'exposure_s'
     """
     names = list(known)
     asked = re.sub(r"[^a-z0-9.]+", "_", name.lower()).strip("_")
     stem = asked.rpartition("_")[0]
-    same = [one for one in names if one == asked] or [one for one in names if stem and one.rpartition("_")[0] == stem]
+    same = [candidate for candidate in names if candidate == asked] or [
+        candidate for candidate in names if stem and candidate.rpartition("_")[0] == stem
+    ]
     if same:
         return same[0]
-    if len(asked) >= 4 and (found := [one for one in names if one.startswith(asked)]):
-        return min(found, key=len)
+    if len(asked) >= 4 and (beginning := [candidate for candidate in names if candidate.startswith(asked)]):
+        return min(beginning, key=len)
     return next(iter(difflib.get_close_matches(asked, names, 1, LIKENESS)), None)
 
 
 def in_its_unit(name: str) -> str:
-    """Return a name with the unit of its ending in words: `exposure_s, in seconds`."""
+    """Return a name with the unit of its ending in words.
+
+    >>> in_its_unit("exposure_s")
+    'exposure_s, in seconds'
+    """
     unit = next((words for ending, words in UNITS.items() if name.endswith(f"_{ending}")), None)
     return f"{name}, in {unit}" if unit else name
 
@@ -207,14 +246,14 @@ class TableRow:
         """Return the cell as a number of `least` or more. Raises InputError."""
         text = self.cells[name]
         try:
-            found = float(text)
+            number = float(text)
         except ValueError:
-            found = math.nan
-        if not (math.isfinite(found) and found >= least):
+            number = math.nan
+        if not (math.isfinite(number) and number >= least):
             raise InputError(
                 f"{self.file}: row {self.number}: {name} = '{text}' isn't a number of {least:g} or more; correct it"
             )
-        return found
+        return number
 
     def known(self, name: str, least: float = 0.0) -> float | None:
         """Return the cell as a number; None where it is empty or has no column."""
@@ -222,8 +261,19 @@ class TableRow:
 
 
 def table_rows(file: Path, needed: Sequence[str], known: Sequence[str]) -> list[TableRow]:
-    """Return the rows of `file`, which has the columns `needed` and no others than `known`. Raises InputError with one
-    line.
+    r"""Return the rows of a table.
+
+    file : CSV in any of the forms that `plain_csv` knows
+    needed, known : columns that it must have, and those that it may have
+
+    Raises InputError with one line for an unknown or a missing column.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "levels.csv"
+    ...     _ = file.write_text("exposure_s,mean_dn\n0.01,100\n")
+    ...     table_rows(file, ["exposure_s"], ["exposure_s", "mean_dn"])[0].value("mean_dn")
+    100.0
     """
     try:
         reader = csv.reader(read_foreign_csv(file).text.splitlines())
@@ -236,11 +286,11 @@ def table_rows(file: Path, needed: Sequence[str], known: Sequence[str]) -> list[
     unknown = [name for name in header if name not in known]
     missing = [name for name in needed if name not in header]
     if unknown or missing:
-        told = [f"missing: {', '.join(missing)}"] if missing else []
+        problems = [f"missing: {', '.join(missing)}"] if missing else []
         near = {name: nearest_name(name, known) for name in unknown}
-        hints = [name + (f" (write {in_its_unit(one)})" if one else "") for name, one in near.items()]
-        told += [f"unknown: {', '.join(hints)}"] if unknown else []
-        raise InputError(f"{file}: columns {'; '.join(told)}; columns are {', '.join(known)}, in these units")
+        hints = [name + (f" (write {in_its_unit(hint)})" if hint else "") for name, hint in near.items()]
+        problems += [f"unknown: {', '.join(hints)}"] if unknown else []
+        raise InputError(f"{file}: columns {'; '.join(problems)}; columns are {', '.join(known)}, in these units")
     if not rows:
         raise InputError(f"{file}: holds no levels; write one row a level and channel")
     for number, row in rows:
@@ -287,7 +337,11 @@ class CgatsSpectra:
 
 
 def get_quantity(name: str) -> Quantity:
-    """Return the quantity of that name. Raises InputError for another."""
+    """Return the quantity of a name, as a type checker knows it. Raises InputError for another.
+
+    >>> get_quantity("radiance")
+    'radiance'
+    """
     for known in _WRITTEN:
         if name == known:
             return known
@@ -301,48 +355,63 @@ def read_cgats(file: Path) -> CgatsSpectra:
     """
     try:
         text = read_foreign_text(file)
-        found = parse_cgats(text.text)
+        parsed = parse_cgats(text.text)
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
-    return CgatsSpectra(found.spectra, found.quantity, (*text.remarks, *found.remarks))
+    return CgatsSpectra(parsed.spectra, parsed.quantity, (*text.remarks, *parsed.remarks))
 
 
 def parse_cgats(text: str) -> CgatsSpectra:
-    """Return the spectra in CGATS text. Its InputError leaves the path to the caller.
+    """Return the spectra in CGATS text.
 
     A spectrum has its SAMPLE_NAME where these differ, else its SAMPLE_ID, or both; of several tables, the table's
-    condition or number before it where the names don't differ.
+    condition or number before it where the names don't differ. Raises InputError without the path, which the caller
+    knows.
+
+    >>> text = '''CGATS.17
+    ... SPECTRAL_BANDS "2"
+    ... SPECTRAL_START_NM "400"
+    ... SPECTRAL_END_NM "500"
+    ... BEGIN_DATA_FORMAT
+    ... SAMPLE_ID SPEC_400 SPEC_500
+    ... END_DATA_FORMAT
+    ... BEGIN_DATA
+    ... white 0.25 0.5
+    ... END_DATA
+    ... '''
+    >>> parse_cgats(text).spectra["white"].value
+    (0.25, 0.5)
     """
     tables = _tables(text)
     remarks: list[str] = []
     read: list[tuple[str, CgatsSpectra]] = []
     for number, table in enumerate(tables, start=1):
         try:
-            found = _spectra(table)
+            spectra_of_table = _spectra(table)
         except InputError as error:
             raise InputError(f"table {number}: {error}" if len(tables) > 1 else str(error)) from error
-        if found is None:
+        if spectra_of_table is None:
             remarks.append(f"table {number} is left out: it has no spectral fields")
             continue
-        remarks += found.remarks
-        read.append((table.condition or f"table {number}", found))
+        remarks += spectra_of_table.remarks
+        read.append((table.condition or f"table {number}", spectra_of_table))
     if not read:
         raise InputError("has no fields SPEC_nnn of two wavelengths or more; give a file with spectral data")
-    quantities = {one.quantity for _, one in read}
+    quantities = {spectra_of_table.quantity for _, spectra_of_table in read}
     if len(quantities) > 1:
         stated = ", ".join(sorted(name or "not stated" for name in quantities))
         raise InputError(f"its {len(read)} tables are of several quantities ({stated}); give one file a quantity")
-    names = [name for _, one in read for name in one.spectra]
+    names = [name for _, spectra_of_table in read for name in spectra_of_table.spectra]
     if len(set(names)) == len(names):
-        spectra = {name: value for _, one in read for name, value in one.spectra.items()}
+        spectra = {name: value for _, spectra_of_table in read for name, value in spectra_of_table.spectra.items()}
     else:
         titles = [title for title, _ in read]
         if len(set(titles)) < len(titles):
             titles = [f"table {number}" for number in range(1, len(read) + 1)]
         spectra = {
             f"{title} {name}": value
-            for title, (_, one) in zip(titles, read, strict=True)
-            for name, value in one.spectra.items()
+            for title, (_, spectra_of_table) in zip(titles, read, strict=True)
+            for name, value in spectra_of_table.spectra.items()
         }
         remarks.append(f"{len(read)} tables with the same samples: named {', '.join(titles)}")
     return CgatsSpectra(spectra, quantities.pop(), tuple(dict.fromkeys(remarks)))
@@ -510,27 +579,38 @@ def _wavelengths(keywords: Mapping[str, str], named_nm: list[float]) -> list[flo
         for name, at in zip(named_nm, exact, strict=True):
             if abs(name - at) > 1.0:  # the names are rounded to whole nanometres
                 raise InputError(f"the field of {name:g} nm is at {at:g} nm by SPECTRAL_START_NM; correct one")
-    for one, other in pairwise(exact):
-        if not one < other:
-            raise InputError(f"{other:g} nm follows {one:g} nm; let the wavelengths ascend")
+    for lower_nm, upper_nm in pairwise(exact):
+        if not lower_nm < upper_nm:
+            raise InputError(f"{upper_nm:g} nm follows {lower_nm:g} nm; let the wavelengths ascend")
     return exact
 
 
 def _number(text: str, what: str) -> float:
     try:
-        found = float(text)
+        value = float(text)
     except ValueError:
-        found = math.nan
-    if not math.isfinite(found):
+        value = math.nan
+    if not math.isfinite(value):
         raise InputError(f"{what} is '{text[:40]}', not a number; correct it")
-    return found
+    return value
 
 
 def write_cgats(file: Path, content: CgatsSpectra) -> tuple[str, ...]:
-    """Write spectra as `.ti3` where the name ends so, else as `.sp`. Returns what was changed for the format.
+    """Write spectra as `.ti3` where the name ends so, else as `.sp`.
 
-    All spectra get one grid of even steps, the finest of them, as the format has no other. Raises InputError where that
-    has more bands than Argyll reads, or the quantity isn't stated.
+    file : to be written
+    content : spectra by name, and their quantity
+
+    All spectra get one grid of even steps, the finest of them, as the format has no other. Returns what was changed for
+    the format. Raises InputError where that has more bands than Argyll reads, or the quantity isn't stated.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> white = Spectrum(wavelength_nm=(400.0, 500.0, 600.0), value=(0.25, 0.5, 1.0))
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "white.sp"
+    ...     _ = write_cgats(file, CgatsSpectra({"white": white}, "radiance"))
+    ...     [spectrum.wavelength_nm for spectrum in read_cgats(file).spectra.values()]
+    [(400.0, 500.0, 600.0)]
     """
     if content.quantity is None:
         raise InputError(f"{file}: the quantity isn't stated; give one of {', '.join(_WRITTEN)}")
@@ -548,7 +628,7 @@ def _grid(spectra: Mapping[str, Spectrum]) -> tuple[list[float], tuple[str, ...]
     """Evenly spaced wavelengths (nm) for all spectra, and what was changed for that."""
     if not spectra:
         raise InputError("there is no spectrum to write; give one at least")
-    grids = {one.wavelength_nm for one in spectra.values()}
+    grids = {spectrum.wavelength_nm for spectrum in spectra.values()}
     if len(min(grids, key=len)) < 2:
         raise InputError("a spectrum of one sample has no step; give two or more")
     step_nm = min(float(np.diff(grid).min()) for grid in grids)
@@ -586,7 +666,7 @@ def _lines(spectra: Mapping[str, Spectrum], quantity: Quantity, grid_nm: list[fl
     yield f"NUMBER_OF_FIELDS {len(fields) + named}"
     yield from ("BEGIN_DATA_FORMAT", " ".join([*(["SAMPLE_ID"] if named else []), *fields]), "END_DATA_FORMAT", "")
     yield from (f"NUMBER_OF_SETS {len(spectra)}", "BEGIN_DATA")
-    for name, one in spectra.items():
+    for name, spectrum in spectra.items():
         quoted = [f'"{" ".join(name.split())}"'.replace("\\", "/")] if named else []
-        yield " ".join([*quoted, *(repr(float(value)) for value in np.asarray(one.at(grid_nm)) * factor * norm)])
+        yield " ".join([*quoted, *(repr(float(value)) for value in np.asarray(spectrum.at(grid_nm)) * factor * norm)])
     yield "END_DATA"

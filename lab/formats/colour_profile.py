@@ -39,14 +39,20 @@ def _of_colour(camera: CameraModel, file: Path) -> CameraModel:
 
 
 def energy_sensitivities(camera: CameraModel) -> FloatArray:
-    """Sensitivity to energy of R, G, B (columns) at `GRID_NM` (rows), efficiency x wavelength, the highest 1."""
+    """Return the sensitivity to energy of R, G, B (columns) at `GRID_NM` (rows): efficiency x wavelength, the highest
+    1.
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> float(energy_sensitivities(default_camera().camera).max())
+    1.0
+    """
     curves = np.stack([camera.quantum_efficiency[channel].at(GRID_NM) * GRID_NM for channel in CHANNELS], axis=1)
     return np.asarray(curves / curves.max())
 
 
-def left_out(content: CameraFile) -> tuple[str, ...]:
+def list_losses(content: CameraFile) -> tuple[str, ...]:
     """Return a remark on the effects of a camera file, which its curves don't have."""
-    names = ", ".join(one.name for one in content.effects)
+    names = ", ".join(effect.name for effect in content.effects)
     return (f"the curves are those of quantum_efficiency: effects aren't in them ({names})",) if names else ()
 
 
@@ -73,14 +79,22 @@ def write_rawtoaces(file: Path, content: CameraFile) -> tuple[str, ...]:
     }
     with replacing(file) as partial:
         partial.write_text(json.dumps(document, indent=4) + "\n", encoding="utf-8")
-    return left_out(content)
+    return list_losses(content)
 
 
 def colour_matrices(camera: CameraModel, light: str) -> tuple[FloatArray, FloatArray]:
-    """(ColorMatrix, ForwardMatrix), 3 x 3 each, of a camera under an illuminant of colour-science's.
+    """Return (ColorMatrix, ForwardMatrix), 3 x 3 each, of a camera under an illuminant.
+
+    camera : with quantum efficiencies of R, G, B
+    light : name of an illuminant of colour-science
 
     ColorMatrix: XYZ under that light (white of Y = 1) to the camera's own signals, the greatest of white 1.
-    ForwardMatrix: signals divided by white's to XYZ under D50. White is kept exactly by both.
+    ForwardMatrix: signals divided by white's to XYZ under D50. White is kept exactly by both (DNG 1.7.1, chapter 6).
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> colour, forward = colour_matrices(default_camera().camera, "D65")
+    >>> (forward @ np.ones(3)).round(3).tolist()  # XYZ of D50
+    [0.964, 1.0, 0.825]
     """
     colour = colour_science()
     sensitivity = energy_sensitivities(camera)
@@ -133,7 +147,7 @@ def write_dcp(file: Path, content: CameraFile) -> tuple[str, ...]:
     ]
     with replacing(file) as partial:
         partial.write_bytes(_tiff(entries))
-    return left_out(content)
+    return list_losses(content)
 
 
 def _ascii(tag: int, text: str) -> tuple[int, int, int, bytes]:
@@ -142,7 +156,7 @@ def _ascii(tag: int, text: str) -> tuple[int, int, int, bytes]:
 
 
 def _matrix(tag: int, matrix: FloatArray) -> tuple[int, int, int, bytes]:
-    numbers = [value for one in matrix.ravel() for value in (round(float(one) * _DENOMINATOR), _DENOMINATOR)]
+    numbers = [value for element in matrix.ravel() for value in (round(float(element) * _DENOMINATOR), _DENOMINATOR)]
     return tag, _SRATIONAL, 9, struct.pack("<18i", *numbers)
 
 
@@ -190,9 +204,9 @@ def write_icc(file: Path, content: CameraFile) -> tuple[str, ...]:
     )  # fmt: skip
     with replacing(file) as partial:
         partial.write_bytes(head + table + data)
-    return left_out(content)
+    return list_losses(content)
 
 
 def _xyz(value: FloatArray) -> bytes:
     """Return an XYZType of one colour, in s15Fixed16."""
-    return b"XYZ " + struct.pack(">4x3i", *(round(float(one) * 65536) for one in value))
+    return b"XYZ " + struct.pack(">4x3i", *(round(float(component) * 65536) for component in value))

@@ -54,9 +54,9 @@ class Pair:
         return np.asarray(self.stereo.translation_mm, float)
 
 
-def paired(left: CameraFile, right: CameraFile, stereo: StereoFit) -> tuple[CameraFile, Pair]:
+def pair_cameras(left: CameraFile, right: CameraFile, stereo: StereoFit) -> tuple[CameraFile, Pair]:
     """Return two cameras with the intrinsics that were fitted jointly with their pose, where the fit states them."""
-    found = []
+    cameras = []
     for content, matrix, distortion, kind, angle_deg in (
         (
             left,
@@ -74,17 +74,22 @@ def paired(left: CameraFile, right: CameraFile, stereo: StereoFit) -> tuple[Came
         ),
     ):
         if matrix is None:
-            found.append(content)
+            cameras.append(content)
             continue
         geometry = Geometry(
             camera_matrix=matrix, distortion=distortion or (), projection=kind, spline_angle_deg=angle_deg
         )
-        found.append(replace(content, camera=content.camera.model_copy(update={"geometry": geometry})))
-    return found[0], Pair(found[1], stereo)
+        cameras.append(replace(content, camera=content.camera.model_copy(update={"geometry": geometry})))
+    return cameras[0], Pair(cameras[1], stereo)
 
 
 def geometry_of(camera: CameraModel) -> Geometry:
-    """Return the camera's geometry, or the pinhole that its focal length and pitch give."""
+    """Return the camera's geometry, or the pinhole that its focal length and pitch give.
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> round(geometry_of(default_camera().camera).camera_matrix[0][0], 1)  # 8 mm / 3.45 um
+    2318.8
+    """
     if camera.geometry is not None:
         return camera.geometry
     f = camera.lens.known_focal_length_mm * 1e3 / camera.pixel_pitch_um
@@ -122,9 +127,9 @@ def _intrinsics(content: CameraFile, pinhole_counts: Sequence[int]) -> _Intrinsi
         )
     geometry = geometry_of(camera)
     projection = Projection.of(geometry)
-    found = projection.intrinsics(geometry.camera_matrix, geometry.distortion)
-    place = (float(found[0]), float(found[1]), float(found[2]), float(found[3]))
-    remarks = _left_out(content)
+    intrinsics = projection.intrinsics(geometry.camera_matrix, geometry.distortion)
+    place = (float(intrinsics[0]), float(intrinsics[1]), float(intrinsics[2]), float(intrinsics[3]))
+    remarks = _list_losses(content)
     if camera.geometry is None:
         remarks = (
             "geometry: not set; a pinhole of lens.focal_length_mm with its centre in the frame's middle is written",
@@ -137,12 +142,12 @@ def _intrinsics(content: CameraFile, pinhole_counts: Sequence[int]) -> _Intrinsi
         if enough:
             return _Intrinsics("pinhole", place, (*given, *(0.0,) * 8)[: enough[0]], remarks)
         names = projection.coefficients[pinhole_counts[-1] : used]
-        fitted, left_px = _fitted(camera, geometry, Projection("pinhole"), pinhole_counts[-1])
+        fitted, left_px = _fit_coefficients(camera, geometry, Projection("pinhole"), pinhole_counts[-1])
         lost = ", ".join(names)
     elif projection.kind == "equidistant":
         return _Intrinsics("equidistant", place, (*given, *(0.0,) * 4)[:4], remarks)
     else:
-        fitted, left_px = _fitted(camera, geometry, Projection("equidistant"), 4)
+        fitted, left_px = _fit_coefficients(camera, geometry, Projection("equidistant"), 4)
         lost = "the splined stereographic projection"
     remarks = (*_departure(lost, left_px), *remarks)
     kind: ProjectionKind = "pinhole" if projection.kind == "pinhole" else "equidistant"
@@ -152,23 +157,25 @@ def _intrinsics(content: CameraFile, pinhole_counts: Sequence[int]) -> _Intrinsi
 def _departure(lost: str, left_px: float) -> tuple[str, ...]:
     """Return the line on a law that a format doesn't have, with the greatest distance that is left (px)."""
     size = f"{left_px:.2f}" if left_px >= 0.01 else f"{left_px:.1e}"
-    told = left_px > TOLD_PX
-    return (f"distortion: no place for {lost}; the fitted law leaves {size} px at most",) if told else ()
+    is_reported = left_px > TOLD_PX
+    return (f"distortion: no place for {lost}; the fitted law leaves {size} px at most",) if is_reported else ()
 
 
 def _frame(camera: CameraModel, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
     """Return places over the frame that the camera sees, px (n, 2), and their rays (n, 3)."""
-    own = Projection.of(geometry)
+    projection = Projection.of(geometry)
     row, col = np.meshgrid(
         np.linspace(0.0, camera.rows - 1.0, NODES), np.linspace(0.0, camera.cols - 1.0, NODES), indexing="ij"
     )
     image = np.column_stack([col.ravel(), row.ravel()])
-    rays = own.unproject(image, own.intrinsics(geometry.camera_matrix, geometry.distortion))
+    rays = projection.unproject(image, projection.intrinsics(geometry.camera_matrix, geometry.distortion))
     seen = np.all(np.isfinite(rays), axis=1)
     return image[seen], rays[seen]
 
 
-def _fitted(camera: CameraModel, geometry: Geometry, to: Projection, count: int) -> tuple[tuple[float, ...], float]:
+def _fit_coefficients(
+    camera: CameraModel, geometry: Geometry, to: Projection, count: int
+) -> tuple[tuple[float, ...], float]:
     """Return the first `count` coefficients of a law, fitted to a geometry over the frame by least squares in px, and
     the greatest distance that is left (px). The law is linear in them, up to the denominator's, which aren't fitted."""
     image, rays = _frame(camera, geometry)
@@ -187,14 +194,16 @@ def _fitted(camera: CameraModel, geometry: Geometry, to: Projection, count: int)
     return tuple(float(value) for value in solved / scale), float(np.hypot(*left.T).max())
 
 
-def _left_out(content: CameraFile) -> tuple[str, ...]:
+def _list_losses(content: CameraFile) -> tuple[str, ...]:
     """Return a line on the effects of a camera file, with the size of what bends the image further."""
     named = []
-    for one in content.effects:
+    for effect in content.effects:
         moved_px = (
-            abs(one.corner_percent) / 100.0 * content.camera.half_diagonal_px if isinstance(one, Distortion) else 0.0
+            abs(effect.corner_percent) / 100.0 * content.camera.half_diagonal_px
+            if isinstance(effect, Distortion)
+            else 0.0
         )
-        named.append(f"{one.name}: {moved_px:.2f} px in the corners" if moved_px else one.name)
+        named.append(f"{effect.name}: {moved_px:.2f} px in the corners" if moved_px else effect.name)
     return (f"effects: left out ({', '.join(named)})",) if named else ()
 
 
@@ -202,7 +211,7 @@ def _sides(content: CameraFile, pair: Pair | None) -> dict[str, CameraFile]:
     return {"": content} if pair is None else {"left": content, "right": pair.right}
 
 
-def _told(side: str, remarks: tuple[str, ...]) -> tuple[str, ...]:
+def _name_side(side: str, remarks: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"{side}: {remark}" if side else remark for remark in remarks)
 
 
@@ -221,26 +230,40 @@ def _yaml(document: Mapping[str, Any]) -> str:
 
 
 def write_opencv(file: Path, content: CameraFile, pair: Pair | None = None) -> tuple[str, ...]:
-    """Write OpenCV's FileStorage: YAML, XML or JSON by the ending. Returns what it has no place for; raises InputError.
+    """Write OpenCV's FileStorage: YAML, XML or JSON by the ending.
 
-    A pair has the keys M1, D1, M2, D2, R, T (mm), and R1, R2, P1, P2, Q where the fit has a rectification.
+    file : to be written
+    content : the camera, of a pair the left one
+    pair : the right camera and the pose; then the keys are M1, D1, M2, D2, R, T (mm), and R1, R2, P1, P2, Q where the
+        fit has a rectification
+
+    Returns what the format has no place for. Raises InputError for another ending.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> from lab.formats.camera_file import default_camera
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = write_opencv(Path(folder) / "left.json", default_camera())
+    ...     "camera_matrix" in (Path(folder) / "left.json").read_text()
+    True
     """
     import cv2
 
     if file.suffix.lower() not in (".yaml", ".yml", ".xml", ".json"):
         raise InputError(f"--to {file}: name a file that ends in .yaml, .yml, .xml or .json")
     cameras = _sides(content, pair)
-    found = {side: _intrinsics(one, (5, 8)) for side, one in cameras.items()}
+    intrinsics_of_side = {side: _intrinsics(camera, (5, 8)) for side, camera in cameras.items()}
     store = cv2.FileStorage(file.suffix.lower(), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     remarks: tuple[str, ...] = ()
-    for number, (side, one) in enumerate(found.items(), start=1):
+    for number, (side, intrinsics) in enumerate(intrinsics_of_side.items(), start=1):
         camera, end = cameras[side].camera, f"_{side}" if side else ""
         store.write(f"image_width{end}", camera.cols)
         store.write(f"image_height{end}", camera.rows)
-        store.write(f"fisheye_model{end}", int(one.kind == "equidistant"))
-        store.write(f"M{number}" if side else "camera_matrix", one.camera_matrix)
-        store.write(f"D{number}" if side else "distortion_coefficients", np.array(one.coefficients).reshape(-1, 1))
-        remarks += _told(side, one.remarks)
+        store.write(f"fisheye_model{end}", int(intrinsics.kind == "equidistant"))
+        store.write(f"M{number}" if side else "camera_matrix", intrinsics.camera_matrix)
+        store.write(
+            f"D{number}" if side else "distortion_coefficients", np.array(intrinsics.coefficients).reshape(-1, 1)
+        )
+        remarks += _name_side(side, intrinsics.remarks)
     if pair is not None:
         store.write("R", pair.rotation)
         store.write("T", pair.translation_mm.reshape(3, 1))
@@ -269,25 +292,25 @@ def write_ros(file: Path, content: CameraFile, pair: Pair | None = None) -> tupl
     """
     remarks: tuple[str, ...] = ()
     at = pair.stereo.rectification if pair is not None else None
-    for side, one in _sides(content, pair).items():
-        found = _intrinsics(one, (5, 8))
-        rotation, projection = np.eye(3), np.column_stack([found.camera_matrix, np.zeros(3)])
+    for side, side_content in _sides(content, pair).items():
+        intrinsics = _intrinsics(side_content, (5, 8))
+        rotation, projection = np.eye(3), np.column_stack([intrinsics.camera_matrix, np.zeros(3)])
         if at is not None:
             rotation = np.asarray(at.rotation_left if side == "left" else at.rotation_right, float)
             projection = np.array(at.projection_left if side == "left" else at.projection_right, float)
             projection[:, 3] *= METRE_PER_MM
         document = {
-            "image_width": one.camera.cols,
-            "image_height": one.camera.rows,
-            "camera_name": re.sub(r"\W+", "_", one.name) or "camera",
-            "camera_matrix": _matrix(found.camera_matrix),
-            "distortion_model": _ROS_MODELS[len(found.coefficients)],
-            "distortion_coefficients": _matrix(np.array([found.coefficients])),
+            "image_width": side_content.camera.cols,
+            "image_height": side_content.camera.rows,
+            "camera_name": re.sub(r"\W+", "_", side_content.name) or "camera",
+            "camera_matrix": _matrix(intrinsics.camera_matrix),
+            "distortion_model": _ROS_MODELS[len(intrinsics.coefficients)],
+            "distortion_coefficients": _matrix(np.array([intrinsics.coefficients])),
             "rectification_matrix": _matrix(rotation),
             "projection_matrix": _matrix(projection),
         }
         _write(_beside(file, side), _yaml(document))
-        remarks += _told(side, found.remarks)
+        remarks += _name_side(side, intrinsics.remarks)
     if pair is not None and at is None:
         remarks += (f"pose: left out, the fit has no rectification (baseline {pair.stereo.baseline_mm:g} mm)",)
     return remarks
@@ -303,8 +326,8 @@ def write_kalibr(file: Path, content: CameraFile, pair: Pair | None = None) -> t
     """
     document: dict[str, Any] = {}
     remarks: tuple[str, ...] = ()
-    for number, (side, one) in enumerate(_sides(content, pair).items()):
-        found = _intrinsics(one, (4,))
+    for number, (side, side_content) in enumerate(_sides(content, pair).items()):
+        intrinsics = _intrinsics(side_content, (4,))
         entry: dict[str, Any] = {}
         if pair is not None:
             entry["cam_overlaps"] = [1 - number]
@@ -314,13 +337,13 @@ def write_kalibr(file: Path, content: CameraFile, pair: Pair | None = None) -> t
             entry["T_cn_cnm1"] = pose.tolist()
         document[f"cam{number}"] = entry | {
             "camera_model": "pinhole",
-            "intrinsics": list(found.focal_centre_px),
-            "distortion_model": "radtan" if found.kind == "pinhole" else "equidistant",
-            "distortion_coeffs": list(found.coefficients),
-            "resolution": [one.camera.cols, one.camera.rows],
+            "intrinsics": list(intrinsics.focal_centre_px),
+            "distortion_model": "radtan" if intrinsics.kind == "pinhole" else "equidistant",
+            "distortion_coeffs": list(intrinsics.coefficients),
+            "resolution": [side_content.camera.cols, side_content.camera.rows],
             "rostopic": f"/cam{number}/image_raw",
         }
-        remarks += _told(side, found.remarks)
+        remarks += _name_side(side, intrinsics.remarks)
     _write(file, _yaml(document))
     return remarks
 
@@ -334,13 +357,13 @@ def write_colmap(file: Path, content: CameraFile, pair: Pair | None = None) -> t
     """
     lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     remarks: tuple[str, ...] = ()
-    for number, (side, one) in enumerate(_sides(content, pair).items(), start=1):
-        found = _intrinsics(one, (0, 4, 8))
-        model = "OPENCV_FISHEYE" if found.kind == "equidistant" else _COLMAP_MODELS[len(found.coefficients)]
-        fx, fy, cx, cy = found.focal_centre_px
-        numbers = " ".join(repr(value) for value in (fx, fy, cx + 0.5, cy + 0.5, *found.coefficients))
-        lines.append(f"{number} {model} {one.camera.cols} {one.camera.rows} {numbers}")
-        remarks += _told(side, found.remarks)
+    for number, (side, side_content) in enumerate(_sides(content, pair).items(), start=1):
+        intrinsics = _intrinsics(side_content, (0, 4, 8))
+        model = "OPENCV_FISHEYE" if intrinsics.kind == "equidistant" else _COLMAP_MODELS[len(intrinsics.coefficients)]
+        fx, fy, cx, cy = intrinsics.focal_centre_px
+        numbers = " ".join(repr(value) for value in (fx, fy, cx + 0.5, cy + 0.5, *intrinsics.coefficients))
+        lines.append(f"{number} {model} {side_content.camera.cols} {side_content.camera.rows} {numbers}")
+        remarks += _name_side(side, intrinsics.remarks)
     _write(file, "\n".join(lines) + "\n")
     if pair is not None:
         remarks += (f"pose: left out, cameras.txt has none (baseline {pair.stereo.baseline_mm:g} mm)",)
@@ -357,30 +380,30 @@ def write_mrcal(file: Path, content: CameraFile, pair: Pair | None = None) -> tu
     import cv2
 
     remarks: tuple[str, ...] = ()
-    for side, one in _sides(content, pair).items():
+    for side, side_content in _sides(content, pair).items():
         pose = np.zeros(6)
         if pair is not None and side == "right":
             pose[:3] = cv2.Rodrigues(pair.rotation)[0].ravel()
             pose[3:] = pair.translation_mm * METRE_PER_MM
-        if one.camera.geometry is not None and one.camera.geometry.projection != "pinhole":
-            model, numbers, told = _splined(one, one.camera.geometry)
+        if side_content.camera.geometry is not None and side_content.camera.geometry.projection != "pinhole":
+            model, numbers, losses = _convert_to_splines(side_content, side_content.camera.geometry)
         else:
-            found = _intrinsics(one, (0, 4, 5, 8))
-            model, told = _MRCAL_MODELS[len(found.coefficients)], found.remarks
-            numbers = (*found.focal_centre_px, *found.coefficients)
+            intrinsics = _intrinsics(side_content, (0, 4, 5, 8))
+            model, losses = _MRCAL_MODELS[len(intrinsics.coefficients)], intrinsics.remarks
+            numbers = (*intrinsics.focal_centre_px, *intrinsics.coefficients)
         text = (
-            f"# {' '.join(one.name.split())}, by calibench\n"
+            f"# {' '.join(side_content.name.split())}, by calibench\n"
             "{\n"
             f"    'lensmodel':  '{model}',\n\n"
             f"    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....\n"
-            f"    'intrinsics': {_listed(numbers)},\n\n"
+            f"    'intrinsics': {_format_list(numbers)},\n\n"
             f"    # the transformation from the reference to the camera: Rodrigues' vector, and m\n"
-            f"    'extrinsics': {_listed(pose)},\n\n"
-            f"    'imagersize': [ {one.camera.cols}, {one.camera.rows}, ]\n"
+            f"    'extrinsics': {_format_list(pose)},\n\n"
+            f"    'imagersize': [ {side_content.camera.cols}, {side_content.camera.rows}, ]\n"
             "}\n"
         )
         _write(_beside(file, side), text)
-        remarks += _told(side, told)
+        remarks += _name_side(side, losses)
     return remarks
 
 
@@ -389,7 +412,7 @@ def write_mrcal(file: Path, content: CameraFile, pair: Pair | None = None) -> tu
 _ACROSS, _SAMPLES, _MARGIN = 40, 6, 2
 
 
-def _splined(content: CameraFile, geometry: Geometry) -> tuple[str, tuple[float, ...], tuple[str, ...]]:
+def _convert_to_splines(content: CameraFile, geometry: Geometry) -> tuple[str, tuple[float, ...], tuple[str, ...]]:
     """Return mrcal's LENSMODEL_SPLINED_STEREOGRAPHIC of a fisheye: its name, its intrinsics, and what is left.
 
     u = 2 tan(theta / 2) in the direction of the ray; q = f (u + d(u)) + c, with d two surfaces of cubic B-splines over
@@ -397,8 +420,8 @@ def _splined(content: CameraFile, geometry: Geometry) -> tuple[str, tuple[float,
     """
     from scipy.interpolate import BSpline  # here: the library takes a while to load
 
-    own, stereographic = Projection.of(geometry), Projection("splined_stereographic", 90.0)
-    intrinsics = own.intrinsics(geometry.camera_matrix, geometry.distortion)
+    fitted, stereographic = Projection.of(geometry), Projection("splined_stereographic", 90.0)
+    intrinsics = fitted.intrinsics(geometry.camera_matrix, geometry.distortion)
     focal, centre = intrinsics[:2], intrinsics[2:4]
     image, rays = _frame(content.camera, geometry)
     u = np.column_stack(stereographic.plane(rays))
@@ -419,7 +442,7 @@ def _splined(content: CameraFile, geometry: Geometry) -> tuple[str, tuple[float,
         for half in [(0.5 * (count - 1) - 1.0 - 1e-9) / per_u]
     ]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)  # rows: y
-    shift = (own.project(stereographic.rays(*grid.T), intrinsics) - centre) / focal - grid
+    shift = (fitted.project(stereographic.rays(*grid.T), intrinsics) - centre) / focal - grid
     across, down = (np.linalg.pinv(basis(axis, count)) for axis, count in zip(axes, counts, strict=True))
     surfaces = shift.reshape(len(axes[1]), len(axes[0]), 2)
     control = np.einsum("ia,abk,jb->ijk", down, surfaces, across, optimize=True)
@@ -427,8 +450,8 @@ def _splined(content: CameraFile, geometry: Geometry) -> tuple[str, tuple[float,
     left_px = float(np.hypot(*((u + bent) * focal + centre - image).T).max())
     model = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={counts[0]}_Ny={counts[1]}_fov_x_deg={degrees}"
     numbers = (*intrinsics[:4].tolist(), *control.ravel().tolist())
-    return model, numbers, (*_departure(f"the {own.kind} projection", left_px), *_left_out(content))
+    return model, numbers, (*_departure(f"the {fitted.kind} projection", left_px), *_list_losses(content))
 
 
-def _listed(values: Sequence[float] | FloatArray) -> str:
+def _format_list(values: Sequence[float] | FloatArray) -> str:
     return f"[ {' '.join(f'{float(value)!r},' for value in values)} ]"

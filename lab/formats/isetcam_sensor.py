@@ -38,8 +38,8 @@ def _sensor(content: CameraFile) -> dict[str, Any]:
     camera = content.camera
     volt_per_e = camera.conversion_gain_dn_per_e * VOLT_PER_DN
     curves = [camera.quantum_efficiency[channel] for channel in camera.channels]
-    first = STEP_NM * np.floor(min(one.wavelength_nm[0] for one in curves) / STEP_NM)
-    last = STEP_NM * np.ceil(max(one.wavelength_nm[-1] for one in curves) / STEP_NM)
+    first = STEP_NM * np.floor(min(curve.wavelength_nm[0] for curve in curves) / STEP_NM)
+    last = STEP_NM * np.ceil(max(curve.wavelength_nm[-1] for curve in curves) / STEP_NM)
     wavelength_nm = np.arange(first, last + 0.5 * STEP_NM, STEP_NM)
     column, empty = wavelength_nm[:, None], np.zeros((0, 0))
     pitch_m = camera.pixel_pitch_um * 1e-6
@@ -78,7 +78,7 @@ def _sensor(content: CameraFile) -> dict[str, Any]:
         },
         "spectrum": {"wave": column},
         "color": {
-            "filterSpectra": np.stack([one.at(wavelength_nm) for one in curves], axis=1),
+            "filterSpectra": np.stack([curve.at(wavelength_nm) for curve in curves], axis=1),
             "filterNames": names,
             "irFilter": np.ones_like(column),
         },
@@ -103,21 +103,21 @@ def _sensor(content: CameraFile) -> dict[str, Any]:
 def _remarks(content: CameraFile) -> list[str]:
     camera = content.camera
     codes = 2**camera.bit_depth
-    found = []
+    remarks = []
     well_e = codes / camera.conversion_gain_dn_per_e
     if abs(camera.full_well_e - well_e) > 1e-3 * well_e:
-        found.append(
+        remarks.append(
             f"full_well_e: {camera.full_well_e:g} e left out, ISETCam's well is its converter's: {well_e:.6g} e"
         )
     if camera.white_level_dn < codes - 1:
-        found.append(f"white_level_dn: {camera.white_level_dn:g} DN left out, ISETCam's converter ends at {codes} DN")
+        remarks.append(f"white_level_dn: {camera.white_level_dn:g} DN left out, ISETCam's converter ends at {codes} DN")
     if camera.row_noise_e:
-        found.append(f"row_noise_e: {camera.row_noise_e:g} e left out, ISETCam has no such noise")
+        remarks.append(f"row_noise_e: {camera.row_noise_e:g} e left out, ISETCam has no such noise")
     if camera.dark_current_doubling_c is not None and camera.dark_current_e_per_s:
-        found.append(
+        remarks.append(
             f"dark_current_doubling_c: {camera.dark_current_doubling_c:g} C left out, the dark voltage is that at "
             f"{camera.dark_current_reference_c:g} C"
         )
     if content.effects:
-        found.append(f"effects: left out ({', '.join(one.name for one in content.effects)})")
-    return found
+        remarks.append(f"effects: left out ({', '.join(effect.name for effect in content.effects)})")
+    return remarks

@@ -106,14 +106,16 @@ def write_lensfun(file: Path, content: CameraFile) -> tuple[str, ...]:
     centre = _centre(camera)
     if centre != (0.0, 0.0):
         ET.SubElement(entry, "center", x=f"{centre[0]:.9g}", y=f"{centre[1]:.9g}")
-    found = ET.SubElement(entry, "calibration")
-    ET.SubElement(found, "distortion", model="poly5", focal=focal, k1=f"{k1:.9g}", k2=f"{k2:.9g}")
+    calibration = ET.SubElement(entry, "calibration")
+    ET.SubElement(calibration, "distortion", model="poly5", focal=focal, k1=f"{k1:.9g}", k2=f"{k2:.9g}")
     if camera.cfa != "MONO":
-        ET.SubElement(found, "tca", model="poly3", focal=focal, vr=f"{red:.9g}", vb=f"{blue:.9g}")
+        ET.SubElement(calibration, "tca", model="poly3", focal=focal, vr=f"{red:.9g}", vb=f"{blue:.9g}")
     named = {f"k{n}": f"{k:.9g}" for n, k in enumerate(shading, start=1)}
     for distance_m in ("10", f"{FAR_M:g}"):
         ET.SubElement(
-            found, "vignetting", {"model": "pa", "focal": focal, "aperture": aperture, "distance": distance_m} | named
+            calibration,
+            "vignetting",
+            {"model": "pa", "focal": focal, "aperture": aperture, "distance": distance_m} | named,
         )
     ET.indent(root)
     with replacing(file) as partial:
@@ -150,12 +152,12 @@ def _poly5(camera: CameraModel, effects: Sequence[Effect]) -> tuple[float, float
     geometry, half = geometry_of(camera), _half_short_px(camera)
     matrix = geometry.camera_matrix
     col, row = _grid(camera)
-    to_col, to_row = (np.asarray(one, float) for one in distort(col, row, geometry))
+    to_col, to_row = (np.asarray(coordinate, float) for coordinate in distort(col, row, geometry))
     x, y = (col - matrix[0][2]) / half, (row - matrix[1][2]) / half
     u, v = (to_col - matrix[0][2]) / half, (to_row - matrix[1][2]) / half
-    for one in effects:
-        if isinstance(one, Distortion):
-            share = one.corner_percent / 100.0 * (u * u + v * v) * (half / camera.half_diagonal_px) ** 2
+    for effect in effects:
+        if isinstance(effect, Distortion):
+            share = effect.corner_percent / 100.0 * (u * u + v * v) * (half / camera.half_diagonal_px) ** 2
             u, v = u * (1.0 + share), v * (1.0 + share)
     r2 = x * x + y * y
     design = np.concatenate([np.stack([x * r2, x * r2**2], axis=1), np.stack([y * r2, y * r2**2], axis=1)])
@@ -168,13 +170,13 @@ def _poly5(camera: CameraModel, effects: Sequence[Effect]) -> tuple[float, float
 
 def _moments(camera: CameraModel) -> dict[str, tuple[float, float]]:
     """Mean of t and of t^2 by channel in light of equal energy, t = (wavelength - 550 nm) / 100 nm."""
-    found = {}
+    moments = {}
     for channel, curve in camera.quantum_efficiency.items():
         wavelength_nm, value = curve.arrays
         t, weight = (wavelength_nm - REFERENCE_NM) / 100.0, value * np.gradient(wavelength_nm)
         total = float(weight.sum())
-        found[channel] = (float((weight * t).sum()) / total, float((weight * t * t).sum()) / total)
-    return found
+        moments[channel] = (float((weight * t).sum()) / total, float((weight * t * t).sum()) / total)
+    return moments
 
 
 def _scales(camera: CameraModel, effects: Sequence[Effect]) -> tuple[float, float]:
@@ -182,10 +184,10 @@ def _scales(camera: CameraModel, effects: Sequence[Effect]) -> tuple[float, floa
     if camera.cfa == "MONO":
         return 1.0, 1.0
     moments, scale = _moments(camera), dict.fromkeys(("R", "G", "B"), 1.0)
-    for one in effects:
-        if isinstance(one, LateralChromaticAberration):
+    for effect in effects:
+        if isinstance(effect, LateralChromaticAberration):
             for channel, (mean, square) in moments.items():
-                scale[channel] += (one.slope_um * mean + one.curvature_um * square) / camera.half_diagonal_um
+                scale[channel] += (effect.slope_um * mean + effect.curvature_um * square) / camera.half_diagonal_um
     return scale["R"] / scale["G"], scale["B"] / scale["G"]
 
 
@@ -195,9 +197,9 @@ def _pa(camera: CameraModel, effects: Sequence[Effect]) -> tuple[tuple[float, fl
     light = np.asarray(relative_illumination(camera, row, col), float).ravel()
     row0, col0 = optical_axis_px(camera)
     r2 = ((col - col0) ** 2 + (row - row0) ** 2) / camera.half_diagonal_px**2
-    for one in effects:
-        if isinstance(one, Vignetting):
-            light = light * (1.0 - one.corner_loss_percent / 100.0 * r2 ** (0.5 * one.exponent))
+    for effect in effects:
+        if isinstance(effect, Vignetting):
+            light = light * (1.0 - effect.corner_loss_percent / 100.0 * r2 ** (0.5 * effect.exponent))
     design = np.stack([r2, r2**2, r2**3], axis=1)
     k, *_ = np.linalg.lstsq(design, light - 1.0, rcond=None)
     left = float(np.abs(light - 1.0 - design @ k).max())
@@ -206,10 +208,22 @@ def _pa(camera: CameraModel, effects: Sequence[Effect]) -> tuple[tuple[float, fl
 
 
 def read_lensfun(file: Path, camera: CameraModel, model: str = "") -> LensfunLens:
-    """Return the lens `model` of a lensfun file, or its only one, at the focal length and the aperture of a camera.
+    """Return a lens of a lensfun file at the focal length and the aperture of a camera.
+
+    file : XML of lensfun's database
+    camera : before which the lens is
+    model : name of the lens; by default the file's only one
 
     Raises InputError, one line that begins with the file: it isn't lensfun's, or holds several lenses or not this one,
     or this one isn't calibrated for such a camera.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> from lab.formats.camera_file import default_camera
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "lens.xml"
+    ...     _ = write_lensfun(file, default_camera())
+    ...     read_lensfun(file, default_camera().camera).focal_length_mm
+    8.0
     """
     try:
         if file.stat().st_size > MOST_BYTES:
@@ -219,7 +233,7 @@ def read_lensfun(file: Path, camera: CameraModel, model: str = "") -> LensfunLen
         raise InputError(f"{file}: can't be read ({error.strerror}); give a lensfun XML file") from error
     except (ET.ParseError, InputError) as error:
         raise InputError(f"{file}: isn't lensfun's XML ({one_line(error)}); give a file of its database") from error
-    lenses = [one for one in root.iter("lens") if one.find("calibration") is not None]
+    lenses = [lens for lens in root.iter("lens") if lens.find("calibration") is not None]
     if root.tag != "lensdatabase" or not lenses:
         raise InputError(f"{file}: holds no lens with a calibration; give a file of lensfun's database")
     name, element = _choose(file, lenses, model)
@@ -231,8 +245,8 @@ def read_lensfun(file: Path, camera: CameraModel, model: str = "") -> LensfunLen
 
 def _choose(file: Path, lenses: Sequence[ET.Element], model: str) -> tuple[str, ET.Element]:
     """Return the lens of this name. Lenses that share a name have their maker, mounts and crop factor in it."""
-    models = [_text(one, "model") for one in lenses]
-    names = [name if models.count(name) == 1 else _full_name(one) for name, one in zip(models, lenses, strict=True)]
+    models = [_text(lens, "model") for lens in lenses]
+    names = [name if models.count(name) == 1 else _full_name(lens) for name, lens in zip(models, lenses, strict=True)]
     names = [
         f"{name} #{names[: at + 1].count(name)}" if names.count(name) > 1 else name for at, name in enumerate(names)
     ]
@@ -248,7 +262,7 @@ def _choose(file: Path, lenses: Sequence[ET.Element], model: str) -> tuple[str, 
 
 
 def _full_name(lens: ET.Element) -> str:
-    mounts = "/".join(one.text or "" for one in lens.findall("mount"))
+    mounts = "/".join(mount.text or "" for mount in lens.findall("mount"))
     return ", ".join(
         part
         for part in (
@@ -262,7 +276,7 @@ def _full_name(lens: ET.Element) -> str:
 
 
 def _text(element: ET.Element, tag: str) -> str:
-    return next((one.text or "" for one in element.findall(tag) if "lang" not in one.attrib), "").strip()
+    return next((child.text or "" for child in element.findall(tag) if "lang" not in child.attrib), "").strip()
 
 
 #: Coefficients of each model in lensfun's order, with the values that stand for an absent one.
@@ -328,8 +342,8 @@ class _Calibrations:
                 f"has the projection {projection!r}, and a camera file holds a pinhole's (rectilinear) with k1, k2, k3 "
                 "alone; take a rectilinear lens, or fit boards of this one"
             )
-        found = {kind: correction for kind in _TERMS if (correction := self._correction(kind)) is not None}
-        bent, tca, dark = (found.get(kind) for kind in ("distortion", "tca", "vignetting"))
+        correction_of_kind = {kind: correction for kind in _TERMS if (correction := self._correction(kind)) is not None}
+        bent, tca, dark = (correction_of_kind.get(kind) for kind in ("distortion", "tca", "vignetting"))
         real_mm, centre = self._real_focal_mm(bent), self.element.find("center")
         law: Callable[[FloatArray], FloatArray] | None = None if real_mm is None else _undistorted
         decentring = (0.0, 0.0)
@@ -357,10 +371,10 @@ class _Calibrations:
     def _correction(self, kind: str) -> _Correction | None:
         """Return this kind of correction from the calibration with the smallest frame that covers the camera's. None:
         there is none, or none for the camera's focal length."""
-        having = [one for one in self.element.findall("calibration") if self._lines(one, kind)]
+        having = [calibration for calibration in self.element.findall("calibration") if self._lines(calibration, kind)]
         if not having:
             return None
-        diagonals = [FULL_FRAME_MM / self._crop(one) for one in having]
+        diagonals = [FULL_FRAME_MM / self._crop(calibration) for calibration in having]
         needed_mm = 2e-3 * self.camera.half_diagonal_um
         covering = [at for at, diagonal in enumerate(diagonals) if needed_mm <= diagonal * COVERED]
         if not covering:
@@ -374,11 +388,11 @@ class _Calibrations:
         model = lines[0].get("model", "")
         if model not in _TERMS[kind]:
             raise InputError(f"{kind} of model {model!r} isn't known here; {', '.join(_TERMS[kind])} are")
-        alike = [one for one in lines if one.get("model") == model]
+        alike = [line for line in lines if line.get("model") == model]
         if len(alike) < len(lines):
             self.remarks.append(f"{kind}: {model} is read, {len(lines) - len(alike)} lines of other models aren't")
-        entries = self._last_of_each_place(kind, [self._entry(one, kind, model) for one in alike])
-        if not self._serves(kind, sorted({one.focal_mm for one in entries})):
+        entries = self._last_of_each_place(kind, [self._entry(line, kind, model) for line in alike])
+        if not self._serves(kind, sorted({entry.focal_mm for entry in entries})):
             return None
         half_mm = 0.5 * diagonals[at]
         return _Correction(kind, model, entries, half_mm, half_mm / math.hypot(1.0, self._aspect(having[at])))
@@ -387,15 +401,15 @@ class _Calibrations:
         """Return the last calibration of each focal length, and of vignetting also aperture and distance, which is the
         one that lensfun takes, and note places whose calibrations differ."""
         last: dict[tuple[float, float, float], _Entry] = {}
-        for one in entries:
-            place = (one.focal_mm, one.aperture, one.distance_m)
-            other = last.get(place, one)
-            if not np.array_equal(other.terms, one.terms) or other.real_focal_mm != one.real_focal_mm:
+        for entry in entries:
+            place = (entry.focal_mm, entry.aperture, entry.distance_m)
+            earlier = last.get(place, entry)
+            if not np.array_equal(earlier.terms, entry.terms) or earlier.real_focal_mm != entry.real_focal_mm:
                 self.remarks.append(
-                    f"{kind}: several calibrations at {one.focal_mm:g} mm differ, and the last one is taken, as "
+                    f"{kind}: several calibrations at {entry.focal_mm:g} mm differ, and the last one is taken, as "
                     "lensfun does; remove those that don't apply"
                 )
-            last[place] = one
+            last[place] = entry
         return tuple(last.values())
 
     def _serves(self, kind: str, focals_mm: list[float]) -> bool:
@@ -408,14 +422,17 @@ class _Calibrations:
             )
             return False
         if kind != "vignetting" and wanted not in focals_mm:
-            below, above = (one for one in focals_mm if one < wanted), (one for one in focals_mm if one > wanted)
+            below, above = (
+                (focal_mm for focal_mm in focals_mm if focal_mm < wanted),
+                (focal_mm for focal_mm in focals_mm if focal_mm > wanted),
+            )
             span = _span(max(below, default=low), min(above, default=high))
             self.remarks.append(f"{kind}: taken at {wanted:g} mm from calibrations at {span} mm")
         return True
 
     @staticmethod
     def _lines(calibration: ET.Element, kind: str) -> list[ET.Element]:
-        return [one for one in calibration.findall(kind) if one.get("model") != "none"]
+        return [line for line in calibration.findall(kind) if line.get("model") != "none"]
 
     def _crop(self, calibration: ET.Element) -> float:
         stated = calibration.get("cropfactor") or _text(self.element, "cropfactor")
@@ -424,7 +441,7 @@ class _Calibrations:
                 "has no cropfactor, the unit of its radii; add that of the camera it was calibrated on to <lens>, as "
                 "in <cropfactor>1.5</cropfactor>"
             )
-        return _stated(stated, "cropfactor")
+        return _parse_number(stated, "cropfactor")
 
     def _aspect(self, calibration: ET.Element) -> float:
         """Return the longer side of the calibration's frame over the shorter one."""
@@ -433,7 +450,7 @@ class _Calibrations:
             self.remarks.append("aspect-ratio isn't stated: 3:2 is taken, lensfun's default")
             return DEFAULT_ASPECT
         wide, _, narrow = stated.partition(":")
-        aspect = _stated(wide, "aspect-ratio") / _stated(narrow or "1", "aspect-ratio")
+        aspect = _parse_number(wide, "aspect-ratio") / _parse_number(narrow or "1", "aspect-ratio")
         return max(aspect, 1.0 / aspect)
 
     def _entry(self, line: ET.Element, kind: str, model: str) -> _Entry:
@@ -449,21 +466,22 @@ class _Calibrations:
         """Return the coefficients at the camera's focal length."""
         entries = correction.entries
         powers = np.array([_power(correction.kind, correction.model, index) for index in range(len(entries[0].terms))])
-        at_mm = np.array([one.focal_mm for one in entries])
-        scaled = np.array([one.terms * one.focal_mm**powers for one in entries])
+        at_mm = np.array([entry.focal_mm for entry in entries])
+        scaled = np.array([entry.terms * entry.focal_mm**powers for entry in entries])
         low, high = at_mm.min(), at_mm.max()
         place_mm = min(max(self.focal_mm, low), high)
         return np.asarray(_hermite(at_mm, scaled, place_mm) / place_mm**powers, float)
 
     def _real_focal_mm(self, bent: _Correction | None) -> float | None:
         """Return the real focal length, stated in the lines of the distortion or in lines of its own."""
-        pairs = [(one.focal_mm, one.real_focal_mm) for one in bent.entries if one.real_focal_mm] if bent else []
+        pairs = [(entry.focal_mm, entry.real_focal_mm) for entry in bent.entries if entry.real_focal_mm] if bent else []
         pairs = pairs or [
-            (_value(one, "focal"), _value(one, "real-focal")) for one in self.element.iter("real-focal-length")
+            (_value(element, "focal"), _value(element, "real-focal"))
+            for element in self.element.iter("real-focal-length")
         ]
         if not pairs:
             return None
-        at_mm, real_mm = (np.array(one, float) for one in zip(*pairs, strict=True))
+        at_mm, real_mm = (np.array(column, float) for column in zip(*pairs, strict=True))
         if not at_mm.min() * (1.0 - MARKED_SHARE) <= self.focal_mm <= at_mm.max() * (1.0 + MARKED_SHARE):
             span = _span(at_mm.min(), at_mm.max())
             self.remarks.append(f"real-focal: left out, as it is stated at {span} mm, not at {self.focal_mm:g} mm")
@@ -476,13 +494,13 @@ class _Calibrations:
         powers = np.array([_power("vignetting", dark.model, index) for index in range(3)])
         low, high = self._focal_range_mm(entries)
         far = [
-            math.hypot((one.focal_mm - focal_mm) / ((high - low) or 1.0), 4.0 / one.aperture - 4.0 / self.aperture,
-                       0.1 / one.distance_m - 0.1 / FAR_M)
-            for one in entries
+            math.hypot((entry.focal_mm - focal_mm) / ((high - low) or 1.0), 4.0 / entry.aperture - 4.0 / self.aperture,
+                       0.1 / entry.distance_m - 0.1 / FAR_M)
+            for entry in entries
         ]  # fmt: skip
         nearest = min(range(len(entries)), key=far.__getitem__)
         if far[nearest] > FARTHEST:
-            apertures = [one.aperture for one in entries]
+            apertures = [entry.aperture for entry in entries]
             self.remarks.append(
                 f"vignetting: left out, as it is calibrated at f/{_span(min(apertures), max(apertures))}, too far from "
                 f"f/{self.aperture:g}"
@@ -491,11 +509,11 @@ class _Calibrations:
         if far[nearest] < EXACT:
             k = entries[nearest].terms
         else:
-            weight = np.array([one**-NEARNESS_POWER for one in far])
-            scaled = np.array([one.terms * one.focal_mm**powers for one in entries])
+            weight = np.array([distance**-NEARNESS_POWER for distance in far])
+            scaled = np.array([entry.terms * entry.focal_mm**powers for entry in entries])
             k = weight @ scaled / weight.sum() / focal_mm**powers
-            one = entries[nearest]
-            place = f"at {one.focal_mm:g} mm, f/{one.aperture:g}, {one.distance_m:g} m"
+            entry = entries[nearest]
+            place = f"at {entry.focal_mm:g} mm, f/{entry.aperture:g}, {entry.distance_m:g} m"
             mean = f"weighted mean of {len(entries)} calibrations, the nearest" if len(entries) > 1 else "as calibrated"
             self.remarks.append(f"vignetting: {mean} {place}")
         unit_mm = dark.half_diagonal_mm if dark.model == "pa" else focal_mm
@@ -506,7 +524,7 @@ class _Calibrations:
         stated = self.element.find("focal")
         if stated is not None and stated.get("min") and stated.get("max"):
             return _value(stated, "min"), _value(stated, "max")
-        focals = [_value(one, "focal") for kind in _TERMS for one in self.element.iter(kind)]
+        focals = [_value(element, "focal") for kind in _TERMS for element in self.element.iter(kind)]
         return min(focals), max(focals)
 
 
@@ -541,19 +559,19 @@ def _value(element: ET.Element, key: str, otherwise: float | None = None) -> flo
             raise InputError(f"<{element.tag}> has no {key}; add it")
         return otherwise
     above_0 = key in ("focal", "real-focal", "aperture", "distance", "min", "max")
-    return _stated(text, f"{key} of <{element.tag}>", above_0=above_0)
+    return _parse_number(text, f"{key} of <{element.tag}>", above_0=above_0)
 
 
-def _stated(text: str, what: str, above_0: bool = True) -> float:
+def _parse_number(text: str, what: str, above_0: bool = True) -> float:
     try:
-        found = float(text)
+        value = float(text)
     except ValueError:
-        found = math.nan
-    if not math.isfinite(found) or (above_0 and found <= 0):
+        value = math.nan
+    if not math.isfinite(value) or (above_0 and value <= 0):
         comma = COMMA_NUMBER.fullmatch(text.strip())
         remedy = f"write {text.strip().replace(',', '.')}, with a decimal point" if comma else "correct it"
         raise InputError(f"{what} is '{text[:20]}', not a number{' above 0' if above_0 else ''}; {remedy}")
-    return found
+    return value
 
 
 def _undistorted(r_mm: FloatArray) -> FloatArray:
@@ -591,7 +609,7 @@ def with_lens(content: CameraFile, lens: LensfunLens) -> tuple[CameraFile, tuple
     taken: list[type[Effect]] = []
     added: list[Effect] = []
     if lens.centre is not None:
-        camera = _centred(camera, lens.centre)
+        camera = _centre_camera(camera, lens.centre)
     if lens.distortion is not None:
         geometry, left_px = _brown(camera, lens)
         camera = camera.model_copy(update={"geometry": geometry})
@@ -612,16 +630,16 @@ def with_lens(content: CameraFile, lens: LensfunLens) -> tuple[CameraFile, tuple
         camera = camera.model_copy(update={"lens": camera.lens.model_copy(update={"illumination": curve})})
         taken.append(Vignetting)
     if lens.tca is not None and camera.cfa != "MONO":
-        found, left_px = _lateral_colour(camera, lens.tca)
-        added.append(found)
+        colour, left_px = _lateral_colour(camera, lens.tca)
+        added.append(colour)
         taken.append(LateralChromaticAberration)
         if left_px > TOLD_PX:
             remarks.append(f"tca: one scale a channel, that of the corner, leaves {left_px:.2f} px of lensfun's law")
-    kept = [one for one in content.effects if not isinstance(one, tuple(taken))]
+    kept = [effect for effect in content.effects if not isinstance(effect, tuple(taken))]
     return replace(content, camera=camera, effects=(*kept, *added)), tuple(remarks)
 
 
-def _centred(camera: CameraModel, centre: tuple[float, float]) -> CameraModel:
+def _centre_camera(camera: CameraModel, centre: tuple[float, float]) -> CameraModel:
     """Return the camera with the optical axis at this place, from the frame's middle in half of its shorter side."""
     geometry, half_px = geometry_of(camera), _half_short_px(camera)
     (fx, skew, _), (shear, fy, _), last = geometry.camera_matrix
@@ -638,17 +656,17 @@ def _brown(camera: CameraModel, lens: LensfunLens) -> tuple[Geometry, float]:
     share = np.linspace(0.0, 1.0, 8 * NODES)[1:]  # of the half diagonal
     lands = lens.distortion(share * radius_px * camera.pixel_pitch_um * 1e-3) * share
     design = np.stack([share, share**3, share**5, share**7], axis=1)
-    found, *_ = np.linalg.lstsq(design, lands, rcond=None)
-    scale = float(found[0])
+    coefficients, *_ = np.linalg.lstsq(design, lands, rcond=None)
+    scale = float(coefficients[0])
     centre = float(lens.distortion(np.zeros(1))[0])
     if not min(scale, centre) > 0:
         raise InputError(f"distortion scales the centre by {min(scale, centre):.3g}, not above 0; take another lens")
-    left_px = float(np.abs(lands - design @ found).max()) * radius_px
+    left_px = float(np.abs(lands - design @ coefficients).max()) * radius_px
     undistorted = _focal_px(camera)  # focal length (px) of the law's undistorted radii
     if lens.real_focal_length_mm is not None:
         undistorted = lens.real_focal_length_mm * 1e3 / camera.pixel_pitch_um / centre
     focal = undistorted * scale
-    k = found[1:] / scale * (undistorted / radius_px) ** np.array([2, 4, 6])
+    k = coefficients[1:] / scale * (undistorted / radius_px) ** np.array([2, 4, 6])
     p1, p2 = lens.decentring
     before: NDArray[np.float64] = np.array(geometry_of(camera).camera_matrix)
     matrix = ((focal, 0.0, float(before[0, 2])), (0.0, focal, float(before[1, 2])), (0.0, 0.0, 1.0))
@@ -664,11 +682,13 @@ def _lateral_colour(
     curves = tca(share * camera.half_diagonal_um * 1e-3)
     corner = [float(curve[-1]) for curve in curves]
     left = (np.abs(curve - at) * share for curve, at in zip(curves, corner, strict=True))
-    left_px = max(float(one.max()) for one in left) * camera.half_diagonal_px
+    left_px = max(float(curve.max()) for curve in left) * camera.half_diagonal_px
     moments, r_um = _moments(camera), camera.half_diagonal_um
     (r1, r2), (g1, g2), (b1, b2) = (moments[channel] for channel in "RGB")
     # (R + a r1 + b r2) = v (R + a g1 + b g2) for red, and for blue: two equations for a, b
-    rows = np.array([[one - v * g1, two - v * g2] for v, one, two in ((corner[0], r1, r2), (corner[1], b1, b2))])
+    rows = np.array(
+        [[first - v * g1, second - v * g2] for v, first, second in ((corner[0], r1, r2), (corner[1], b1, b2))]
+    )
     slope, curvature = np.linalg.solve(rows, np.array([(v - 1.0) * r_um for v in corner]))
     try:
         return LateralChromaticAberration(slope_um=float(slope), curvature_um=float(curvature)), left_px

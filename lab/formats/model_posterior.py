@@ -46,8 +46,8 @@ class StoredEffect(Frozen):
 
     def effect(self) -> Effect:
         """Return the effect. Raises ValueError for one that the library doesn't have."""
-        found: Effect = library_effect(self.name).model_validate(self.values)
-        return found
+        acting: Effect = library_effect(self.name).model_validate(self.values)
+        return acting
 
 
 class RivalModel(Frozen):
@@ -105,13 +105,14 @@ class ModelPosterior(Frozen):
             first=first, names=names, mean=tuple(float(f"{m:.9g}") for m in mean), covariance=tuple(map(tuple, rows))
         )
 
-    def taken(self, names: list[str]) -> tuple[FloatArray, FloatArray]:
-        """Mean (n,) and covariance (n, n) of the parameters `names`. One that isn't known here has its prior: mean 0,
-        variance 1."""
+    def select(self, names: list[str]) -> tuple[FloatArray, FloatArray]:
+        """Return mean (n,) and covariance (n, n) of the parameters `names`. One that isn't known here has its prior:
+        mean 0, variance 1.
+        """
         known = {name: i for i, name in enumerate(self.names)}
         mean, covariance = np.zeros(len(names)), np.eye(len(names))
         at = [i for i, name in enumerate(names) if name in known]
-        here = [known[names[i]] for i in at]
-        mean[at] = np.array(self.mean)[here]
-        covariance[np.ix_(at, at)] = np.array(self.covariance).reshape(len(known), -1)[np.ix_(here, here)]
+        places = [known[names[i]] for i in at]
+        mean[at] = np.array(self.mean)[places]
+        covariance[np.ix_(at, at)] = np.array(self.covariance).reshape(len(known), -1)[np.ix_(places, places)]
         return mean, covariance

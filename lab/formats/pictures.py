@@ -62,7 +62,7 @@ def picture_facts(file: Path) -> PictureFacts:
     """Return what a picture's file states, without decoding it. Raises InputError, without the path, where its header
     is damaged or its pages aren't frames of one kind."""
     if file.suffix.lower() in TIFFS:
-        with _opened(file) as tif:
+        with _open(file) as tif:
             return _tiff_facts(tif)
     with file.open("rb") as stream:
         data = stream.read(HEAD_BYTES)
@@ -80,7 +80,7 @@ def read_picture(file: Path, page: int | None = None) -> NDArray[Any]:
     `page`: which page of a TIFF; None: its only one. Raises InputError, without the path, where the picture is damaged,
     has several pages and none is chosen, or its codes don't rise with the light."""
     if file.suffix.lower() in TIFFS:
-        with _opened(file) as tif:
+        with _open(file) as tif:
             pages = _frames(tif)
             if page is None and len(pages) > 1:
                 raise InputError(f"has {len(pages)} pages, not 1; give one picture a file")
@@ -100,7 +100,7 @@ class _Contiguous:
         self.first, self.number = first, number
 
 
-def _opened(file: Path) -> Any:
+def _open(file: Path) -> Any:
     try:
         return tifffile.TiffFile(file)
     except Exception as error:
@@ -200,8 +200,8 @@ def _needs_opencv(page: Any) -> bool:
 def _tiff_by_opencv(tif: Any, page: Any, file: Path) -> NDArray[Any]:
     """Decode a page by OpenCV, with its Orientation as stored."""
     data = bytearray(file.read_bytes())
-    for other in tif.pages:
-        tag = other.tags.get(ORIENTATION)
+    for page_of_series in tif.pages:
+        tag = page_of_series.tags.get(ORIENTATION)
         if tag is not None:
             data[tag.valueoffset : tag.valueoffset + 2] = struct.pack(f"{tif.byteorder}H", 1)
     return _by_opencv(bytes(data), page.index)
@@ -219,7 +219,7 @@ def _packed_samples(tif: Any, page: Any, bits: int, file: Path) -> NDArray[Any]:
         if bits < 8 or shift <= 0 or np.any(shifted & ((1 << shift) - 1)):
             raise InputError(f"has compressed samples of {bits} bits; save it uncompressed, or with 16 bits a sample")
         return shifted >> np.array(shift, shifted.dtype)
-    found = np.empty((rows, across), np.uint8 if bits < 8 else np.uint16)
+    samples = np.empty((rows, across), np.uint8 if bits < 8 else np.uint16)
     stride, height = -(-across * bits // 8), page.rowsperstrip or rows
     order = "little" if page.fillorder == 2 else "big"
     per_block = max(1, BLOCK // across)
@@ -236,8 +236,8 @@ def _packed_samples(tif: Any, page: Any, bits: int, file: Path) -> NDArray[Any]:
             each = np.zeros((len(part), across, 16), np.uint8)
             ones = np.unpackbits(part, axis=1, count=across * bits, bitorder=order)  # type: ignore[call-overload]
             each[:, :, 16 - bits :] = ones.reshape(len(part), across, bits)
-            found[first + at : first + at + len(part)] = np.packbits(each, axis=2).view(">u2")[..., 0]
-    return found.reshape(rows, page.imagewidth, -1) if many else found
+            samples[first + at : first + at + len(part)] = np.packbits(each, axis=2).view(">u2")[..., 0]
+    return samples.reshape(rows, page.imagewidth, -1) if many else samples
 
 
 def _by_opencv(data: bytes, page: int = 0) -> NDArray[Any]:
@@ -245,8 +245,8 @@ def _by_opencv(data: bytes, page: int = 0) -> NDArray[Any]:
     buffer = np.frombuffer(data, np.uint8)
     try:
         if page:
-            done, found = cv2.imdecodemulti(buffer, cv2.IMREAD_UNCHANGED, range=(page, page + 1))
-            image = found[0] if done and found else None
+            done, images = cv2.imdecodemulti(buffer, cv2.IMREAD_UNCHANGED, range=(page, page + 1))
+            image = images[0] if done and images else None
         else:
             image = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -260,7 +260,14 @@ def _by_opencv(data: bytes, page: int = 0) -> NDArray[Any]:
 
 
 def png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes, bytes]]:
-    """Yield name, content and checksum of each chunk; the last may be cut off."""
+    """Yield name, content and checksum of each chunk; the last may be cut off.
+
+    data : the file's content, its signature included (Portable Network Graphics, W3C, section 5.3)
+
+    >>> head = PNG + (2).to_bytes(4, "big") + b"sBIT" + b"ab" + b"sum."
+    >>> list(png_chunks(head))
+    [(b'sBIT', b'ab', b'sum.')]
+    """
     at = len(PNG)
     while at + 8 <= len(data):
         length, name = struct.unpack(">I4s", data[at : at + 8])
@@ -270,7 +277,13 @@ def png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes, bytes]]:
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield marker and content of each segment up to the picture."""
+    """Yield marker and content of each segment up to the picture.
+
+    data : the file's content, from its first byte (ITU-T T.81, annex B)
+
+    >>> list(jpeg_segments(bytes([0xFF, 0xD8, 0xFF, 0xE1, 0, 4, 65, 66, 0xFF, 0xDA])))
+    [(225, b'AB')]
+    """
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
         if data[at + 1] == 0xFF:  # a fill byte
@@ -286,8 +299,8 @@ def exif_block(data: bytes) -> bytes | None:
     if data.startswith(PNG):
         return next((content for name, content, _ in png_chunks(data) if name == b"eXIf"), None)
     if data.startswith(JPEG):
-        own = (content for marker, content in jpeg_segments(data) if marker == 0xE1)
-        return next((content[6:] for content in own if content.startswith(b"Exif\0\0")), None)
+        segments = (content for marker, content in jpeg_segments(data) if marker == 0xE1)
+        return next((content[6:] for content in segments if content.startswith(b"Exif\0\0")), None)
     return None
 
 
@@ -310,8 +323,8 @@ def _exif_orientation(block: bytes | None) -> int:
 
 def _significant_bits(data: bytes) -> int | None:
     """Return the significant bits a sample that a PNG states (its chunk sBIT), where these are fewer than stored."""
-    own = next((content for name, content, _ in png_chunks(data) if name == b"sBIT"), b"")
-    return max(own) if own and max(own) < data[24] else None
+    bits = next((content for name, content, _ in png_chunks(data) if name == b"sBIT"), b"")
+    return max(bits) if bits and max(bits) < data[24] else None
 
 
 def _jpeg_subsampling(data: bytes) -> tuple[int, int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lab.formats.results.words import measured, shown_unit
+from lab.formats.results.words import format_unit, format_value
 
 #: Standard deviations: a figure whose true value is on a limit is outside by chance in 0.13 % of all fits.
 OUTSIDE_SIGMA = 3.0
@@ -40,8 +40,8 @@ class Plausible:
             (self.is_above(value, std), "above", self.upper, self.above),
         ):
             if outside and limit is not None:
-                bound = f"{limit:.4g} {shown_unit(unit)}".rstrip()
-                return f"{name} {measured(value, std, unit)} is {place} the limit of {bound}: {cause}"
+                bound = f"{limit:.4g} {format_unit(unit)}".rstrip()
+                return f"{name} {format_value(value, std, unit)} is {place} the limit of {bound}: {cause}"
         return None
 
 

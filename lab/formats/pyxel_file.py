@@ -110,9 +110,9 @@ def write_pyxel(
 
 def _remarks(content: CameraFile) -> list[str]:
     camera = content.camera
-    found = [f"{name}: left out, Pyxel has no equal law" for name in _LEFT_OUT if getattr(camera, name)]
+    remarks = [f"{name}: left out, Pyxel has no equal law" for name in _LEFT_OUT if getattr(camera, name)]
     if camera.white_level_dn < 2**camera.bit_depth - 1:
-        found.append(f"white_level_dn: left out, Pyxel's converter ends at {2**camera.bit_depth - 1} DN")
+        remarks.append(f"white_level_dn: left out, Pyxel's converter ends at {2**camera.bit_depth - 1} DN")
     if content.effects:
-        found.append(f"effects: left out ({', '.join(one.name for one in content.effects)})")
-    return found
+        remarks.append(f"effects: left out ({', '.join(effect.name for effect in content.effects)})")
+    return remarks

@@ -51,7 +51,8 @@ class RawMetadata(Frozen):
 
 @contextlib.contextmanager
 def replacing(file: Path) -> Iterator[Path]:
-    """A temporary file beside `file`. It replaces `file` when the block succeeds, and is removed when it fails.
+    """Yield a temporary file beside `file`, which replaces `file` when the block succeeds, and is removed when it
+    fails.
 
     Raises InputError where the folder can't be written to.
     """
@@ -204,8 +205,8 @@ def _tag(code: int, kind: int, value: Any) -> tuple[int, int, int, Any]:
 
 
 def colour_matrix(camera: CameraModel) -> FloatArray:
-    """From CIE XYZ to this camera's R, G, B under D65 (3, 3), as DNG's ColorMatrix1 wants it: white has a greatest code
-    of 1.
+    """Return the matrix from CIE XYZ to this camera's R, G, B under D65 (3, 3), as DNG's ColorMatrix1 wants it: white
+    has a greatest code of 1.
 
     Least squares over the 24 patches of the ColorChecker. A camera channel is the electrons from the patch over those
     from white. Raises ValueError for a MONO camera, which has no colours."""
@@ -241,7 +242,11 @@ def _product(*curves: Spectrum) -> float:
 
 @cache
 def daylight() -> Spectrum:
-    """CIE D65 at 100 cd/m^2 of a white diffuser."""
+    """Return CIE D65 at 100 cd/m^2 of a white diffuser, W sr^-1 m^-2 nm^-1.
+
+    >>> daylight().wavelength_nm[0] < 400.0 < daylight().wavelength_nm[-1]
+    True
+    """
     return illuminant("D65", 100.0)
 
 

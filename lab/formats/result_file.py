@@ -19,7 +19,12 @@ Result = TypeVar("Result", bound=BaseModel)
 
 
 def result_json(result: BaseModel) -> str:
-    """Return the text of a result's file."""
+    """Return a result as JSON text, as the commands write it with `--json`.
+
+    >>> from lab.formats.results import FitResult
+    >>> '"format": "calibench-fit"' in result_json(FitResult(source="my-camera", cameras={}))
+    True
+    """
     return result.model_dump_json(indent=1) + "\n"
 
 
@@ -58,18 +63,25 @@ class Provenance(Frozen):
 
 
 def installed_versions() -> dict[str, str]:
-    """Versions of calibench, of the libraries that compute, and of Python."""
-    found = {"python": platform.python_version(), "system": platform.platform(terse=True)}
+    """Return the versions of calibench, of the libraries that compute, and of Python, by name.
+
+    >>> sorted(set(installed_versions()) & {"calibench", "numpy", "python"})
+    ['calibench', 'numpy', 'python']
+    """
+    versions = {"python": platform.python_version(), "system": platform.platform(terse=True)}
     for name in DISTRIBUTIONS:
         try:
-            found[name] = metadata.version(name)
+            versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
 def provenance_of(recordings: RecordingSet, made: datetime | None = None) -> Provenance:
-    """Provenance of an evaluation of `recordings`: reads every frame once. `made`: now, where not given."""
+    """Return the provenance of an evaluation of `recordings`, of which every frame is read once.
+
+    made : time of the evaluation; now by default
+    """
     digests = {
         capture.id: hashlib.sha256(recordings.frame(capture).astype("<u2").tobytes()).hexdigest()
         for capture in recordings.captures()

@@ -11,16 +11,26 @@ from sim.spectrum import Spectrum
 
 
 def parse_spectrum(text: str) -> Spectrum:
-    """Return a spectrum from CSV text with the header `wavelength_nm,value`. Its InputError leaves the path to the
-    caller.
+    r"""Return a spectrum from CSV text with the header `wavelength_nm,value`.
 
     Blank lines and a byte-order mark are ignored. Wavelengths must ascend strictly, and all numbers must be finite.
+    Raises InputError without the path, which the caller knows.
+
+    >>> parse_spectrum("wavelength_nm,value\n400,0.5\n500,1.0\n").value
+    (0.5, 1.0)
     """
     return parse_curve(text, ("value",))[1]
 
 
 def parse_curve(text: str, columns: tuple[str, ...]) -> tuple[str, Spectrum]:
-    """(name of the second column, curve): as `parse_spectrum`, with one of `columns` as that name."""
+    r"""Return (name of the second column, curve), as `parse_spectrum` does.
+
+    text : CSV
+    columns : names that the second column may have
+
+    >>> parse_curve("wavelength_nm,radiance\n400,0.5\n500,1.0\n", ("value", "radiance"))[0]
+    'radiance'
+    """
     try:
         lines = csv.reader(io.StringIO(text.removeprefix("\ufeff"), newline=None))
         rows = [row for row in lines if any(cell.strip() for cell in row)]
@@ -55,6 +65,10 @@ def _quoted(row: list[str]) -> str:
 
 
 def format_spectrum(spectrum: Spectrum) -> str:
-    """Return a spectrum as the format's CSV; reading it gives the same numbers bit for bit."""
+    """Return a spectrum as CSV text; reading it gives the same numbers bit for bit.
+
+    >>> format_spectrum(Spectrum(wavelength_nm=(400.0, 500.0), value=(0.5, 1.0))).splitlines()
+    ['wavelength_nm,value', '400.0,0.5', '500.0,1.0']
+    """
     rows = (f"{at!r},{height!r}\n" for at, height in zip(spectrum.wavelength_nm, spectrum.value, strict=True))
     return "wavelength_nm,value\n" + "".join(rows)

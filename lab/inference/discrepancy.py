@@ -6,13 +6,14 @@ columns H are the changes of the whole prediction, so that an unlisted blur move
 Where no law of `sim` has the state (noise by line, defective pixels), a process acts on an observable of that state,
 along its own axis, as a share of its scale.
 
-What is everyday acts along all coordinates of a state, with one scale. What is unlisted acts along one of them: one
-large process doesn't make the others of its state probable."""
+What is everyday acts along all coordinates of a state, with one scale: of n of them each has s_g / sqrt(n), so that s_g
+is the standard deviation of their sum. Steps in time are one coordinate, a random walk of so many steps. What is
+unlisted acts along one of them: one large process doesn't make the others of its state probable."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, get_args
 
@@ -91,10 +92,12 @@ TRANSFER, FIELD, SPECTRAL, LINES, RESPONSE, SOURCE, OFFSET, SHOT, ROWS, BORDERS 
         "repeatability of grating monochromators: 0.02 to 0.1 nm; healthy sets: none", largest=10.0,
     ),
     GroupDeclaration(
-        "response", 0.0005, "1, of the signal by level and exposure", "healthy sets: 0.015 %",
+        "response", 0.00015, "1, of the signal by level and exposure",
+        "healthy sets: 0.015 % at most; what real converters bend by more is a listed effect",
     ),
     GroupDeclaration(
-        "source in time", 0.0005, "1, of the radiance by time", "stabilised lamps drift by less than 0.1 % in an hour",
+        "source in time", 0.0005, "1, of the radiance by time, of an hour",
+        "stabilised lamps drift by less than 0.1 % in an hour, and in shorter sessions by less in proportion",
     ),
     GroupDeclaration(
         "offset", 0.01, "read noise, of the offset by time, exposure and place",
@@ -181,9 +184,10 @@ def _groups_of_state(
     """Yield what is everyday on a state, of all processes together, and each process by itself, which is unlisted.
     `white`: their columns at the `used` numbers, whitened."""
     name, unit, source = declared.name, declared.unit, declared.source
-    vectors = _strongest(white, _EVERYDAY_MOST * declared.everyday, MOST_COLUMNS)
+    share = np.concatenate([np.full(p.columns.shape[1], p.everyday) for p in processes])
+    vectors = _strongest(white * share, _EVERYDAY_MOST * declared.everyday, MOST_COLUMNS)
     if vectors.shape[1]:
-        kept = np.column_stack([p.columns for p in processes]) @ vectors
+        kept = np.column_stack([p.columns for p in processes]) @ (share[:, None] * vectors)
         yield Group(name, kept[used], declared.everyday, unit, source, 0.0, kept[~used])
     first = 0
     for p in processes:
@@ -193,9 +197,8 @@ def _groups_of_state(
         if own.shape[1]:
             kept = p.columns @ own
             process = Process(p.factor @ own, p.factor @ (np.eye(count) - own @ own.T) @ p.factor.T, p.curve)
-            yield Group(
-                name, kept[used], 0.0, unit, source, declared.largest, kept[~used], process, 3.0 * declared.everyday
-            )  # fmt: skip
+            least = 3.0 * p.everyday * declared.everyday
+            yield Group(name, kept[used], 0.0, unit, source, declared.largest, kept[~used], process, least)
 
 
 def _is_of_boards(model: MeasurementModel, name: str) -> bool:
@@ -213,12 +216,14 @@ def _strongest(white: FloatArray, largest: float, most: int) -> FloatArray:
 @dataclass(frozen=True)
 class _Columns:
     """Columns (n, m) of one process: changes of the numbers by independent standard normal coefficients. `factor` (k,
-    m): those coefficients -> the process at its nodes. `most`: directions that are kept."""
+    m): those coefficients -> the process at its nodes. `most`: directions that are kept. `everyday`: its everyday scale
+    over that of the state."""
 
     columns: FloatArray
     factor: FloatArray
     curve: StateCurve | ObservableCurve
     most: int
+    everyday: float = 1.0
 
 
 # --- processes on states of the chain ---------------------------------------------------------------------------------
@@ -233,7 +238,7 @@ _LEAST_FACTOR = 0.02
 class StateCurve:
     """A process along one axis of a state: its nodes `at`, and `unit`, by which the state changes where its value is 1.
     A table that repeats after `period` indices has no nodes. Values of the first `fixed` nodes are none. `curves`: of
-    so many channels, one after the other."""
+    so many channels, one after the other. `everyday`: the everyday scale of the values, over that of the state."""
 
     stage: Stage
     along: Along | Directed
@@ -244,6 +249,7 @@ class StateCurve:
     fixed: int = 0
     curves: int = 1
     correlated: float = _NODES_CORRELATED
+    everyday: float = 1.0
 
     @property
     def nodes(self) -> int:
@@ -327,13 +333,18 @@ class BordersCurve(StateCurve):
         return ScreenGamma(exponent=1.0 + float(values[k]), rim_px=self.at[k])
 
 
-def _on_state(model: MeasurementModel, base: FloatArray, curves: Iterator[StateCurve]) -> Iterator[_Columns]:
+def _on_state(model: MeasurementModel, base: FloatArray, curves: Iterable[StateCurve]) -> Iterator[_Columns]:
+    curves = list(curves)
+    steps = [curve for curve in curves if curve.is_step]
+    coordinates = len(curves) - len(steps) + bool(steps)
     for curve in curves:
         own = [(model.mean((curve.law(_STEP * one),)) - base) / _STEP for one in np.eye(curve.nodes)]
         table = np.column_stack(own)
         if table.any():
             factor = np.asarray(np.linalg.cholesky(curve.kernel), float)
-            yield _Columns(table @ factor, factor, curve, max(MOST_COLUMNS, curve.period))
+            share = 1.0 / np.sqrt(coordinates * (len(steps) if curve.is_step else 1))
+            most = max(MOST_COLUMNS, curve.period)
+            yield _Columns(table @ factor, factor, curve, most, curve.everyday * float(share))
 
 
 def _points(at: Sequence[float] | FloatArray) -> tuple[float, ...]:
@@ -415,11 +426,13 @@ def _steps(stage: Stage, at: Sequence[float], unit: float = 1.0) -> Iterator[Sta
 
 def _source(dataset: Dataset) -> Iterator[StateCurve]:
     lit = ("flat", "narrowband")
-    yield StateCurve("light", "time", "mean", _times_s(dataset, _MOST_TIMES, lit))
-    yield from _steps("light", _times_s(dataset, _MOST_STEPS, lit))
+    at = _times_s(dataset, _MOST_TIMES, lit)
+    curves = [StateCurve("light", "time", "mean", at), *_steps("light", _times_s(dataset, _MOST_STEPS, lit))]
     if len(dataset.channels) > 1:
-        at = _times_s(dataset, _FEW_TIMES, lit)
-        yield StateCurve("light", "plane x time", "mean", at, curves=len(dataset.channels))
+        few = _times_s(dataset, _FEW_TIMES, lit)
+        curves.append(StateCurve("light", "plane x time", "mean", few, curves=len(dataset.channels)))
+    hours = (at[-1] - at[0]) / 3600.0
+    yield from (replace(curve, everyday=min(hours, 1.0)) for curve in curves)
 
 
 def _offset(dataset: Dataset) -> Iterator[StateCurve]:
@@ -496,13 +509,14 @@ def _on_observables(model: MeasurementModel, names: Sequence[str], used: int) ->
         yield _Columns(own, factor, curve, MOST_ON_OBSERVABLE)
 
 
-def observable_kernel(*blocks: Observable) -> FloatArray:
-    """Kernel over the numbers of blocks of one measurement: squared exponential along the axis, reduced between
-    channels and between conditions."""
+def observable_kernel(*blocks: Observable, is_invariant: bool = False) -> FloatArray:
+    """Kernel over the numbers of blocks of one measurement: squared exponential along the axis, 1 of a law that doesn't
+    depend on it (`is_invariant`), reduced between channels and between conditions."""
     first = blocks[0]
     x = np.concatenate([b.position.reshape(len(b.value), -1) for b in blocks])
     labels = [label for b in blocks for label in b.labels]
-    kernel = np.exp(-0.5 * np.square((x[:, None] - x) / first.reach).sum(-1))
+    reach = np.inf if is_invariant else first.reach
+    kernel = np.exp(-0.5 * np.square((x[:, None] - x) / reach).sum(-1))
     channel = np.array([label.channel for label in labels])
     condition = np.array([label.condition for label in labels])
     kernel = kernel * np.where(channel[:, None] == channel, 1.0, _BETWEEN)

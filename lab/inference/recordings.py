@@ -56,6 +56,7 @@ class SideModel:
     numbers: Numbers | None = None
     parameters: dict[str, tuple[EffectParameter, ...]] = field(default_factory=dict)
     _prepared: dict[Restatement, Changes] = field(default_factory=dict)
+    _kernels: dict[tuple[int, bool], FloatArray] = field(default_factory=dict)
 
     @property
     def value(self) -> FloatArray:
@@ -97,7 +98,9 @@ class SideModel:
         """N(m, S + J P J'), with the form errors of the effects at `form_scale` times their tolerance.
 
         A law's error is a share of its change. It is smooth along the observable's axis, and in the logarithm of the
-        change: numbers of one place that the law changes differently (in time, after other light) err differently."""
+        change: numbers of one place that the law changes differently (in time, after other light) err differently.
+        Where the law doesn't depend on the axis (`Effect.invariances`), its error doesn't, either: it is one share of
+        all numbers that the law changes by the same share of their scale."""
         effects, changes = self.effects(state), self.changes(state)
         gaussian = self.measured.gaussian(effects, None, 0.0)
         if changes:
@@ -112,15 +115,20 @@ class SideModel:
             for index in self.measured.affected_blocks(effect):
                 own = change[self.measured.slices[index]]
                 if own.any():
-                    size = np.log(np.maximum(np.abs(own), 1e-9 * np.abs(own).max()))
-                    alike = self._kernels[index] * np.exp(-0.5 * np.square(size[:, None] - size))
+                    block = self.measured.blocks[index]
+                    is_invariant = block.measurement.axis in type(effect).invariances
+                    size = np.abs(own) / block.scale if is_invariant else np.abs(own)
+                    size = np.log(np.maximum(size, 1e-9 * size.max()))
+                    alike = self._kernel(index, is_invariant) * np.exp(-0.5 * np.square(size[:, None] - size))
                     error = form_scale * effect.form_tolerance * own
                     gaussian = gaussian.with_discrepancy(index, error[:, None] * alike * error)
         return gaussian
 
-    @cached_property
-    def _kernels(self) -> tuple[FloatArray, ...]:
-        return tuple(observable_kernel(block) for block in self.measured.blocks)
+    def _kernel(self, index: int, is_invariant: bool) -> FloatArray:
+        key = index, is_invariant
+        if key not in self._kernels:
+            self._kernels[key] = observable_kernel(self.measured.blocks[index], is_invariant=is_invariant)
+        return self._kernels[key]
 
     def has_form_error(self, state: State) -> bool:
         """Whether any effect declares a form tolerance."""

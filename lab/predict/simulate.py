@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from lab.errors import InputError
-from lab.formats.camera_file import CameraFile, default_camera, read_camera, traced_table
+from lab.formats.camera_file import CameraFile, default_camera, read_camera, trace_table
 from lab.formats.raw_file import (
     Frame,
     RawMetadata,
@@ -133,7 +133,7 @@ def with_lens(
 ) -> CameraFile:
     """Return the camera with the lens of a prescription, f-number and focal length included. Raises InputError for a
     file that can't be used."""
-    table = traced_table(lens, cache, progress)
+    table = trace_table(lens, cache, progress)
     model = content.camera
     try:
         traced = Lens(

@@ -176,14 +176,14 @@ class GrowingCurves:
         camera = recordings.camera(capture.side)
         black, top = camera.black_level_dn or 0.0, camera.saturation_dn
         for name, plane in planes(frame, camera.cfa).items():
-            other = planes(before, camera.cfa)[name].astype(np.int32)
-            difference = plane.astype(np.int32) - other
+            earlier = planes(before, camera.cfa)[name].astype(np.int32)
+            difference = plane.astype(np.int32) - earlier
             self._transfer.append(
                 TransferPoint(
                     side=capture.side,
                     channel=name,
                     exposure_s=capture.exposure_s,
-                    mean_dn=float((plane.mean() + other.mean()) / 2.0 - black),
+                    mean_dn=float((plane.mean() + earlier.mean()) / 2.0 - black),
                     variance_dn2=float(difference.var() / 2.0),
                     saturated=bool(np.mean(plane >= top) > 1e-3),
                 )
@@ -225,8 +225,13 @@ class GrowingCurves:
 
 
 def centre(frame: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Return the middle quarter of a frame, beginning at an even row and column, so that the mosaic stays what it
-    is."""
+    """Return the middle quarter of a frame, beginning at an even row and column, so that the mosaic stays what it is.
+
+    frame : (rows, cols) DN
+
+    >>> centre(np.zeros((480, 640), np.uint16)).shape
+    (240, 320)
+    """
     rows, cols = frame.shape
     row, col = rows // 4 // 2 * 2, cols // 4 // 2 * 2
     return frame[row : rows - row, col : cols - col]

@@ -72,7 +72,7 @@ class QuickLook:
 
     def _ask(self, session_id: str) -> None:
         try:
-            answer = self._asked(session_id)
+            answer = self._read_curves(session_id)
         except Exception as error:
             log.warning("curves of session %s: %s", session_id, error)
             answer = None
@@ -94,11 +94,11 @@ class QuickLook:
             self._process.wait()
             self._process = None
 
-    def _asked(self, session_id: str) -> Curves:
+    def _read_curves(self, session_id: str) -> Curves:
         for _ in range(2):  # it may have ended because nobody asked
             if self._process is None or self._process.poll() is not None:
                 self._end()
-                self._process = self._started()
+                self._process = self._start()
             line = self._answer(self._process, session_id)
             if line:
                 answer = json.loads(line)
@@ -110,7 +110,7 @@ class QuickLook:
                 break
         raise InputError(f"session {session_id}: its curves can't be computed now; the log says more")
 
-    def _started(self) -> subprocess.Popen[str]:
+    def _start(self) -> subprocess.Popen[str]:
         process = subprocess.Popen(
             [sys.executable, "-m", "lab.quick_look.process"],
             stdin=subprocess.PIPE,

@@ -11,7 +11,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from lab.calibration.limits import CalibrationLimits, figures_of, judged
+from lab.calibration.limits import CalibrationLimits, figures_of, judge_figures
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.effect_titles import at_beginning, effect_title
@@ -29,7 +29,7 @@ from lab.formats.results import (
     Skipped,
     ValidationResult,
 )
-from lab.formats.results.words import measured
+from lab.formats.results.words import format_value
 from lab.observables.observable import measurement_title
 from lab.predict.validate import BothModels
 from lab.report import answers, charts, geometry, words
@@ -73,9 +73,9 @@ class _Kernel:
         seen = np.asarray(first.measured, float)
         predicted = {model: np.asarray(pair.predicted, float) for model, pair in pairs.items()}
         margin = trim_margin([seen, *predicted.values()])
-        peak = max(float(one.max()) for one in predicted.values())
+        peak = max(float(kernel.max()) for kernel in predicted.values())
         # at least 5 % of the peak, so that noise doesn't look like a difference
-        limit = max(*(float(np.abs(seen - one).max()) for one in predicted.values()), 0.05 * peak)
+        limit = max(*(float(np.abs(seen - kernel).max()) for kernel in predicted.values()), 0.05 * peak)
         return cls(
             label=first.label,
             channel=first.channel,
@@ -83,11 +83,11 @@ class _Kernel:
             predictions=tuple(
                 _Prediction(
                     model=model,
-                    picture=kernel_picture(one, peak, margin),
-                    difference=difference_picture(seen - one, limit, margin),
+                    picture=kernel_picture(kernel, peak, margin),
+                    difference=difference_picture(seen - kernel, limit, margin),
                     psnr=f"{pairs[model].psnr_peak_db:.1f} dB",
                 )
-                for model, one in predicted.items()
+                for model, kernel in predicted.items()
             ),
             limit=f"{100 * limit / peak:.2g} %",
         )
@@ -146,7 +146,7 @@ def page_environment() -> jinja2.Environment:
     )
 
     def stated(value: float | None, unit: str) -> str:
-        return "" if value is None else measured(value, None, unit)
+        return "" if value is None else format_value(value, None, unit)
 
     environment.filters |= {
         "words": lambda text: str(text).replace("_", " "),
@@ -156,7 +156,7 @@ def page_environment() -> jinja2.Environment:
         "parameter_name": words.parameter_name,
         "parameter_value": words.parameter_value,
         "stated": stated,
-        "stated_as": lambda value, std, unit: "–" if value is None else measured(value, std, unit),
+        "stated_as": lambda value, std, unit: "–" if value is None else format_value(value, std, unit),
         "still": still,
         "setting": told,
         "mood": diagnosis_page.mood,
@@ -177,7 +177,9 @@ def render_report(
     sides = tuple(fit.cameras)
     fitted_checks = validation.checks if validation is not None else ()
     checks = both.baseline if both is not None else fitted_checks
-    by_improved = {(one.name, one.side, one.capture): one for one in both.improved} if both is not None else {}
+    by_improved = (
+        {(check.name, check.side, check.capture): check for check in both.improved} if both is not None else {}
+    )
     model = "baseline" if both is not None else words.FITTED
     curves = diagnosis.curves if diagnosis is not None else ()
     rows = by_side(fit, recordings.manifest.cameras)
@@ -242,17 +244,19 @@ def render_report(
         else {},
         "mtf": {
             side: charts.transfer_overlays(
-                charts.overlay_validated([(one, after(one)) for one in _without_repeats(recordings, of(side, "mtf"))]),
+                charts.overlay_validated(
+                    [(check, after(check)) for check in _without_repeats(recordings, of(side, "mtf"))]
+                ),
                 model=model,
             )
             for side in sides
         },
         "kernels": {
             side: [
-                _Kernel.of({model: pair} | ({"improved model": other} if other else {}))
+                _Kernel.of({model: pair} | ({"improved model": improved_pair} if improved_pair else {}))
                 for check in of(side, "psf")
                 for mended in (after(check),)
-                for pair, other in zip(
+                for pair, improved_pair in zip(
                     check.kernels, mended.kernels if mended else (None,) * len(check.kernels), strict=True
                 )
             ][:KERNELS_A_SIDE]
@@ -264,9 +268,9 @@ def render_report(
             ]
             for side in sides
         },
-        "compared": words.compared(both.baseline if both else (), tuple(by_improved.values()), fitted_checks),
+        "compared": words.compare_checks(both.baseline if both else (), tuple(by_improved.values()), fitted_checks),
         "models": words.models(both is not None, bool(by_improved)),
-        "judgements": judged(figures_of(fit), limits) if limits is not None else (),
+        "judgements": judge_figures(figures_of(fit), limits) if limits is not None else (),
         "stereo": list(stereo_figures(fit.stereo)) if fit.stereo else [],
         "pairs": fit.stereo.pairs if fit.stereo else 0,
         "pair": geometry.stereo_context(recordings, fit.stereo),

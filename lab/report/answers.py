@@ -68,19 +68,19 @@ def _from_zero(value: ParameterValue, quantity: Quantity | None) -> str:
 def odds(diagnosis: DiagnosisResult | None) -> list[tuple[Side, list[tuple[str, float]]]]:
     """Return the probabilities of the models by side: the likeliest sets of effects, none further acting, and all the
     rest; and the rivals, where these aren't among the sets."""
-    found = []
-    for one in diagnosis.models if diagnosis is not None else ():
-        shown = one.sets[:ODDS]
+    likeliest_sets = []
+    for models in diagnosis.models if diagnosis is not None else ():
+        shown = models.sets[:ODDS]
         rows = [(set_in_words(item), item.probability) for item in shown]
         has_unlisted = diagnosis is not None and diagnosis.engine == "evidence"
         rest = "all other sets together" if has_unlisted else "all other sets of listed effects together"
         rows.append((rest, max(1.0 - sum(p for _, p in rows), 0.0)))
         for effect in diagnosis.effects if diagnosis is not None and not has_unlisted else ():
-            if one.side in effect.sides:
+            if models.side in effect.sides:
                 title = effect_title(effect.name)
                 rows += [(f"rival of {title}: {effect_title(r.name)}", r.probability) for r in effect.rivals]
-        found.append((one.side, rows))
-    return found
+        likeliest_sets.append((models.side, rows))
+    return likeliest_sets
 
 
 def set_in_words(item: EffectSet) -> str:
@@ -112,8 +112,14 @@ def effect_line(effect: NamedEffect) -> str:
     return f"{who}: {'; '.join(sizes)}." if sizes else f"{who}."
 
 
-def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
-    """Sentences: implausible figures, the named effects, mismatches without a name, and cameras without a mismatch."""
+def list_findings(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
+    """Yield sentences on implausible figures, the named effects, mismatches without a name, and cameras without a
+    mismatch.
+
+    >>> fit = FitResult(source="my-camera", cameras={}, warnings=("the read noise of 0.001 e is implausible",))
+    >>> any("0.001 e" in sentence for sentence in list_findings(fit, None))
+    True
+    """
     yield from (f"Warning: {line}." for line in fit.warnings)
     if diagnosis is None:
         return
@@ -158,15 +164,15 @@ def _sure_of(effect: NamedEffect) -> str:
 
 
 def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
-    """Sentences: probabilities and rivals, chi2 on held-out captures, and the false-alarm rate."""
+    """Yield sentences on probabilities and rivals, chi2 on held-out captures, and the false-alarm rate."""
     if diagnosis is None:
         yield "The fits' own standard deviations; nothing was compared with a model."
         return
     yield from (_sure_of(effect) for effect in diagnosis.effects[:NAMED])
     if diagnosis.engine == "evidence" and diagnosis.verdict == "no_mismatch":
-        for one in diagnosis.models:
-            nothing = sum(item.probability for item in one.sets if not item.effects and not item.unlisted)
-            yield f"No effect and nothing unlisted in the {one.side} camera: probability {nothing:.3f}."
+        for models in diagnosis.models:
+            nothing = sum(item.probability for item in models.sets if not item.effects and not item.unlisted)
+            yield f"No effect and nothing unlisted in the {models.side} camera: probability {nothing:.3f}."
     held = diagnosis.held_out
     if held is not None and held.n and (diagnosis.effects or diagnosis.discovered):
         laws = held.chi2_discovered
@@ -225,7 +231,7 @@ def _worst(checks: Iterable[Check]) -> dict[Side, list[Check]]:
 def to_do(
     diagnosis: DiagnosisResult | None, left_out: int, warnings: int, implausible: Sequence[str] = ()
 ) -> Iterator[str]:
-    """Sentences: the next capture, what to check, and which model to predict with."""
+    """Yield sentences on the next capture, what to check, and which model to predict with."""
     if implausible:
         yield "Settle the warnings about figures first: what depends on a wrong statement is wrong, too."
     if diagnosis is None:
@@ -246,14 +252,15 @@ def to_do(
         yield f"{left_out} step{'s were' if left_out > 1 else ' was'} left out, each with its remedy, under Left out."
 
 
-def _missed(values: Sequence[float], curve: ResidualCurve) -> float:
+def _rms_residual(values: Sequence[float], curve: ResidualCurve) -> float:
     std = np.maximum(np.asarray(curve.measured_std), 1e-12)
     return float(np.sqrt(np.mean(np.square((np.asarray(curve.measured) - np.asarray(values)) / std))))
 
 
 def proof_curves(diagnosis: DiagnosisResult) -> list[ResidualCurve]:
-    """For each of the first two named effects, the measurement that shows it most, where the baseline fits worst; then
-    the measurements that it fits worst. None where nothing was named."""
+    """Return, for each of the first two named effects, the measurement that shows it most, where the baseline fits
+    worst; then the measurements that it fits worst. None where nothing was named.
+    """
     if not diagnosis.effects:
         return []
     curves = [curve for curve in diagnosis.curves if len(curve.x) > 3]
@@ -268,8 +275,8 @@ def proof_curves(diagnosis: DiagnosisResult) -> list[ResidualCurve]:
 
 
 def proof_words(curve: ResidualCurve) -> tuple[str, str]:
-    """Title and caption of such a measurement."""
-    before, after = _missed(curve.before, curve), _missed(curve.after, curve)
+    """Return the title and caption of such a measurement."""
+    before, after = _rms_residual(curve.before, curve), _rms_residual(curve.after, curve)
     title = measurement_title(curve.measurement)
     caption = (
         f"{curve.label}{', held out' if curve.held_out else ''}: rms residual {_short(before)} σ without the effects, "
@@ -346,7 +353,7 @@ def answers(
     """Return the four questions, each with its answers in sentences. `left_out`: number of skipped steps; `warnings`:
     number of warnings about the recordings."""
     return [
-        ("What was found", list(found(fit, diagnosis))),
+        ("What was found", list(list_findings(fit, diagnosis))),
         ("How sure", list(certainty(diagnosis))),
         ("What it means", list(meaning(diagnosis, validation, both))),
         ("What to do", list(to_do(diagnosis, left_out, warnings, fit.warnings))),
@@ -361,7 +368,7 @@ def context(
     warnings: int,
     both: BothModels | None = None,
 ) -> dict[str, Any]:
-    """Variables of `answers.html`."""
+    """Return the variables of `answers.html`."""
     badge, mood, headline = words.headline(diagnosis)
     return {
         "badge": badge,

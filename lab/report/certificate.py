@@ -18,7 +18,7 @@ from lab.calibration.overview import verdict_of
 from lab.capture.records import RunRecord
 from lab.capture.store import Store
 from lab.errors import InputError
-from lab.formats.results.words import measured
+from lab.formats.results.words import format_value
 from lab.report import write_page
 from lab.report.words import VERDICTS
 from sim.parameters import Frozen
@@ -41,21 +41,21 @@ def _sha256(document: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def certificate(store: Store, one: CalibrationRecord) -> Certificate:
+def certificate(store: Store, calibration: CalibrationRecord) -> Certificate:
     """Return the certificate of a calibration that was certified."""
-    stated = one.model_dump(mode="json", include=_STATED)
-    if one.limits is not None and not one.limits.drafted_from:  # as those of before there was this key
+    stated = calibration.model_dump(mode="json", include=_STATED)
+    if calibration.limits is not None and not calibration.limits.drafted_from:  # as those of before there was this key
         del stated["limits"]["drafted_from"]
-    fit = _sha256(store.result(one.id).document)
+    fit = _sha256(store.result(calibration.id).document)
     return Certificate(stated=stated, fit_sha256=fit, sha256=_sha256({"stated": stated, "fit_sha256": fit}))
 
 
-def rejections(store: Store, found: CalibrationRecord) -> tuple[str, ...]:
+def rejections(store: Store, calibration: CalibrationRecord) -> tuple[str, ...]:
     """Return what speaks against a calibration, or its certificate: limits that were drafted from itself; its session's
     newest diagnosis where that rejects the model, or its lack."""
-    dependence = None if found.limits is None else found.limits.dependence_on(found.id)
+    dependence = None if calibration.limits is None else calibration.limits.dependence_on(calibration.id)
     first = () if dependence is None else (dependence,)
-    newest = store.newest_results(found.session_id)
+    newest = store.newest_results(calibration.session_id)
     if "diagnose" not in newest:
         return (*first, "The session isn't diagnosed: nobody looked whether the model leaves something out.")
     verdict = verdict_of(store, newest["diagnose"])
@@ -65,29 +65,29 @@ def rejections(store: Store, found: CalibrationRecord) -> tuple[str, ...]:
     return (*first, f"The diagnosis rejects the model ({badge}): {words[0].lower()}{words[1:]}")
 
 
-def certificate_page(store: Store, one: CalibrationRecord, runs: tuple[RunRecord, ...]) -> str:
+def certificate_page(store: Store, calibration: CalibrationRecord, runs: tuple[RunRecord, ...]) -> str:
     """Return the page of a calibration that was certified, which needs nothing else and prints on A4. `runs`: how its
     session was captured."""
-    found = certificate(store, one)
-    judged = {(of.figure, of.side, of.place) for of in one.judgements}
-    newest = store.newest_results(one.session_id)
+    stated = certificate(store, calibration)
+    judged = {(of.figure, of.side, of.place) for of in calibration.judgements}
+    newest = store.newest_results(calibration.session_id)
     verdict = VERDICTS[verdict_of(store, newest["diagnose"])][2] if "diagnose" in newest else "not diagnosed"
-    every = life.figures(store, one.id)
+    every = life.figures(store, calibration.id)
     return _template().render(
         version=metadata.version("calibench"),
-        one=one,
-        warnings=rejections(store, one),
-        is_independent=one.limits is None or one.limits.dependence_on(one.id) is None,
+        calibration=calibration,
+        warnings=rejections(store, calibration),
+        is_independent=calibration.limits is None or calibration.limits.dependence_on(calibration.id) is None,
         verdict=verdict,
         others=[figure for figure in every if (figure.name, figure.side, figure.place) not in judged],
         runs=runs,
-        sha256=found.sha256,
-        fit_sha256=found.fit_sha256,
+        sha256=stated.sha256,
+        fit_sha256=stated.fit_sha256,
     )
 
 
 def _value(of: Judgement | Figure) -> str:
-    return "missing" if of.value is None else measured(of.value, of.std, of.unit)
+    return "missing" if of.value is None else format_value(of.value, of.std, of.unit)
 
 
 def _band(band: tuple[float | None, float | None]) -> str:
@@ -103,16 +103,18 @@ def _template() -> jinja2.Template:
     return environment.get_template("certificate.html")
 
 
-def write_certificate(store: Store, one: CalibrationRecord, file: Path) -> Certificate:
+def write_certificate(store: Store, calibration: CalibrationRecord, file: Path) -> Certificate:
     """Write the page of a calibration that was certified as `file` (HTML): completely, or not at all.
 
     Returns what the page states, with its hashes. Raises InputError where the calibration isn't certified or the file
     can't be written."""
-    if one.certified is None:
-        raise InputError(f"calibration {one.id}: is {one.state}, no certificate states it; certify it first")
+    if calibration.certified is None:
+        raise InputError(
+            f"calibration {calibration.id}: is {calibration.state}, no certificate states it; certify it first"
+        )
     try:
-        runs = tuple(store.runs(one.session_id))
+        runs = tuple(store.runs(calibration.session_id))
     except InputError:  # the session was deleted
         runs = ()
-    write_page(file, certificate_page(store, one, runs))
-    return certificate(store, one)
+    write_page(file, certificate_page(store, calibration, runs))
+    return certificate(store, calibration)

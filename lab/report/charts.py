@@ -29,7 +29,7 @@ from lab.formats.results import (
     ResidualCurve,
     SpectralFit,
 )
-from lab.formats.results.words import measured, plain_number
+from lab.formats.results.words import format_value, plain_number
 from lab.observables.observable import measurement_title
 from lab.predict.validate import SensitivityCurve
 from sim.camera import Side
@@ -56,7 +56,11 @@ def _fade(colour: str, opacity: float = FADED) -> str:
 
 
 def axis(title: str, **more: Any) -> dict[str, Any]:
-    """Return a labelled axis in the report's style."""
+    """Return a labelled axis in the report's style; `more`: further keys of Plotly's axis.
+
+    >>> axis("signal, DN", rangemode="tozero")["title"]["text"]
+    'signal, DN'
+    """
     return {
         "title": {"text": title, "standoff": 6},
         "gridcolor": "@grid",
@@ -71,8 +75,13 @@ def axis(title: str, **more: Any) -> dict[str, Any]:
 
 
 def log_axis(title: str, values: Iterable[float], **more: Any) -> dict[str, Any]:
-    """Return a logarithmic axis that holds `values`, with whole numbers at its ticks: 1, 2, 5, 10, 20, ... within
-    `FEW_DECADES`, powers of ten beyond. Values of 0 or below have no place on it."""
+    """Return a logarithmic axis that holds `values`; those of 0 or below have no place on it.
+
+    Its ticks are whole numbers: 1, 2, 5, 10, 20, ... within `FEW_DECADES`, powers of ten beyond.
+
+    >>> log_axis("exposure, s", [0.01, 0.1])["ticktext"]
+    ['0.01', '0.02', '0.05', '0.1']
+    """
     exponents = [math.log10(value) for value in values if value is not None and 0.0 < value < math.inf]
     low, high = (min(exponents), max(exponents)) if exponents else (0.0, 1.0)
     margin = max(LOG_MARGIN * (high - low), 0.05)
@@ -91,7 +100,14 @@ def log_axis(title: str, values: Iterable[float], **more: Any) -> dict[str, Any]
 
 
 def layout(height: int, **more: Any) -> dict[str, Any]:
-    """Return a figure's layout in the report's style."""
+    """Return a figure's layout in the report's style.
+
+    height : px
+    more : further keys of Plotly's layout
+
+    >>> layout(300)["height"]
+    300
+    """
     return {
         "height": height,
         "margin": {"l": 56, "r": 14, "t": 26, "b": 44},
@@ -104,13 +120,28 @@ def layout(height: int, **more: Any) -> dict[str, Any]:
 
 
 def error_bars(std: Sequence[float | None], colour: str) -> dict[str, Any]:
+    """Return error bars of one standard deviation to each side, in a colour.
+
+    std : one for each point; None: none
+
+    >>> error_bars([0.5, None], "#d1495b")["array"]
+    [0.5, None]
+    """
     return {"type": "data", "array": list(std), "color": colour, "thickness": 1, "width": 2}
 
 
 def band(
     x: Sequence[float], centre: np.ndarray[Any, Any], half: np.ndarray[Any, Any], colour: str, **more: Any
 ) -> Trace:
-    """Return a filled band centre +- half."""
+    """Return a filled band centre +- half.
+
+    x : (n,)
+    centre, half : (n,), in one unit
+    more : further keys of the trace
+
+    >>> band([1.0, 2.0], np.array([5.0, 6.0]), np.array([0.5, 0.5]), "#d1495b")["y"]
+    [5.5, 6.5, 5.5, 4.5]
+    """
     return {
         "type": "scatter",
         "x": [*x, *reversed(list(x))],
@@ -124,7 +155,7 @@ def band(
 
 
 def photon_transfer(noise: NoiseFit) -> Figure | None:
-    """Temporal variance against signal, with the line of the fitted conversion gain."""
+    """Draw temporal variance against signal, with the line of the fitted conversion gain."""
     if noise.photon_transfer is None:
         return None
     return photon_transfer_points(
@@ -159,7 +190,7 @@ def photon_transfer_points(points: PhotonTransfer, gain: float | None = None, ga
             {
                 "type": "scatter",
                 "mode": "lines",
-                "name": f"slope {measured(gain, gain_std, 'DN/e')}",
+                "name": f"slope {format_value(gain, gain_std, 'DN/e')}",
                 "x": [0.0, top],
                 "y": [0.0, gain * top],
                 "line": {"color": "@fg", "width": 1.5, "dash": "dash"},
@@ -177,8 +208,9 @@ def photon_transfer_points(points: PhotonTransfer, gain: float | None = None, ga
 
 
 def repeat_drift(drift: RepeatDrift) -> Figure:
-    """Means of repeats over time, with the fitted curve where it changes and its standard uncertainty, DN; of several
-    settings in common, departures from each setting's mean."""
+    """Draw the means of repeats over time, with the fitted curve where it changes and its standard uncertainty, DN; of
+    several settings in common, departures from each setting's mean.
+    """
     curve, half = np.array(drift.curve_dn), np.array(drift.curve_dn_std)
     abscissa = "elapsed time, s" if drift.elapsed_s is not None else "number of the repeat"
     x = list(drift.elapsed_s) if drift.elapsed_s is not None else [float(k + 1) for k in range(len(curve))]
@@ -209,7 +241,7 @@ def repeat_drift(drift: RepeatDrift) -> Figure:
 
 
 def linearity(noise: NoiseFit) -> Figure | None:
-    """Deviation from the straight line of the response, per cent of the line."""
+    """Draw the deviation from the straight line of the response, per cent of the line."""
     points = noise.photon_transfer
     if points is None:
         return None
@@ -254,30 +286,30 @@ def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[
     shapes: list[dict[str, Any]] = []
     notes: list[dict[str, Any]] = []
     channels = list(spectral.quantum_efficiency)
-    for one in spectral.maker_departures:
-        colour = CHANNEL.get(one.channel, "#888888")
+    for departure in spectral.maker_departures:
+        colour = CHANNEL.get(departure.channel, "#888888")
         half = 0.5 * float(np.median(np.diff(spectral.wavelength_nm)))
-        bottom = 0.95 - 0.055 * channels.index(one.channel)
-        at = {"x0": one.from_nm - half, "x1": one.to_nm + half}
+        bottom = 0.95 - 0.055 * channels.index(departure.channel)
+        at = {"x0": departure.from_nm - half, "x1": departure.to_nm + half}
         look = {"type": "rect", "fillcolor": _fade(colour), "line": {"width": 0}, "layer": "below"}
         shapes.append(look | at | {"yref": "paper", "y0": bottom, "y1": bottom + 0.05})
         shapes.append(look | at | {"yref": "paper", "y0": 0.0, "y1": bottom, "fillcolor": _fade(colour, 0.07)})
-        size = "new" if one.difference_percent is None else f"{one.difference_percent:+.1f} %"
-        if one.to_nm - one.from_nm + 2 * half < LABELLED_SHARE * (
+        size = "new" if departure.difference_percent is None else f"{departure.difference_percent:+.1f} %"
+        if departure.to_nm - departure.from_nm + 2 * half < LABELLED_SHARE * (
             spectral.wavelength_nm[-1] - spectral.wavelength_nm[0]
         ):
             continue  # no room for its label
         notes.append(
             {
-                "x": 0.5 * (one.from_nm + one.to_nm),
+                "x": 0.5 * (departure.from_nm + departure.to_nm),
                 "y": bottom + 0.025,
                 "yref": "paper",
                 "yanchor": "middle",
                 "text": size,
                 "showarrow": False,
                 "font": {"size": 10, "color": colour},
-                "hovertext": f"{one.channel}, {one.from_nm:g} to {one.to_nm:g} nm: {size}, "
-                f"{one.significance_sigma:.1f} sigma",
+                "hovertext": f"{departure.channel}, {departure.from_nm:g} to {departure.to_nm:g} nm: {size}, "
+                f"{departure.significance_sigma:.1f} sigma",
             }
         )
     return shapes, notes
@@ -344,7 +376,9 @@ def quantum_efficiency(
     shapes, notes = _departures(spectral)
     # Room above the curves for the strips, where there are any.
     highest = max(max(values) for values in spectral.quantum_efficiency.values())
-    highest = max([highest, *(max(*one.baseline, *one.improved) for one in (models or {}).values())])
+    highest = max(
+        [highest, *(max(*sensitivity.baseline, *sensitivity.improved) for sensitivity in (models or {}).values())]
+    )
     top = 1.05 * highest / (0.8 if shapes else 1.0)
     return {
         "data": data,
@@ -409,7 +443,9 @@ def overlay_validated(checks: Sequence[tuple[Check, Check | None]]) -> dict[str,
 
 
 def overlay_explained(curves: Sequence[ResidualCurve], measurement: str = "slanted_edge") -> dict[str, list[Overlay]]:
-    """Panel title -> curves of one measurement from the diagnosis; where a curve exists twice, the held-out one."""
+    """Return the curves of one measurement from the diagnosis, by panel title; where a curve exists twice, the held-out
+    one.
+    """
     chosen: dict[tuple[str, str], ResidualCurve] = {}
     for curve in curves:
         key = (curve.label, curve.channel)
@@ -432,8 +468,9 @@ def _legend(name: str, **look: Any) -> Trace:
 def transfer_overlays(
     panels: Mapping[str, Sequence[Overlay]], columns: int = 3, model: str = "baseline"
 ) -> Figure | None:
-    """Measured MTF (points), the baseline's prediction (dashed), and the improved model's (solid) where effects were
-    named."""
+    """Draw measured MTF (points), the baseline's prediction (dashed), and the improved model's (solid) where effects
+    were named.
+    """
     if not panels:
         return None
     columns = min(columns, len(panels))
@@ -534,7 +571,7 @@ def draw_predicted_patches(patches: Sequence[PatchComparison]) -> Figure:
     for channel in dict.fromkeys(patch.channel for patch in patches):
         mine = [patch for patch in patches if patch.channel == channel]
         colour = CHANNEL.get(channel, "#888888")
-        std = [float(np.hypot(one.measured_dn_std, one.predicted_dn_std)) for one in mine]
+        std = [float(np.hypot(patch.measured_dn_std, patch.predicted_dn_std)) for patch in mine]
         data.append(
             {"type": "scatter", "mode": "markers", "name": channel, "text": [patch.patch for patch in mine]}
             | {"x": [patch.measured_dn for patch in mine], "y": [patch.predicted_dn for patch in mine]}
@@ -567,10 +604,10 @@ def patch_comparison(patches: Sequence[PatchComparison], improved: Sequence[Patc
         names = [patch.patch for patch in mine]
         suffix = "" if number == 0 else str(number + 1)
         on = {"type": "scatter", "yaxis": f"y{suffix}", "showlegend": number == 0}
-        std = [unit * float(np.hypot(one.measured_dn_std, one.predicted_dn_std)) for one in mended or mine]
+        std = [unit * float(np.hypot(patch.measured_dn_std, patch.predicted_dn_std)) for patch in mended or mine]
         for name, values, colour, dash, width in (
-            (first, [one.predicted_dn for one in mine], BEFORE, "dash", 1.6),
-            ("improved model", [one.predicted_dn for one in mended], AFTER, "solid", 1.8),
+            (first, [patch.predicted_dn for patch in mine], BEFORE, "dash", 1.6),
+            ("improved model", [patch.predicted_dn for patch in mended], AFTER, "solid", 1.8),
         ):
             if values:
                 line = {"color": colour, "width": width, "dash": dash}
@@ -598,7 +635,7 @@ def patch_comparison(patches: Sequence[PatchComparison], improved: Sequence[Patc
 
 
 def mismatch_map(diagnosis: DiagnosisResult) -> Figure | None:
-    """Significance of the baseline's mismatches by axis, one row for each side and measurement."""
+    """Draw the significance of the baseline's mismatches by axis, one row for each side and measurement."""
     if not diagnosis.mismatches:
         return None
     rows = list(dict.fromkeys((item.side, item.measurement) for item in diagnosis.mismatches))
@@ -675,7 +712,14 @@ def _residual_traces(name: str, x: Sequence[float], residual: np.ndarray[Any, An
 
 
 def beyond_axis(name: str, residual: np.ndarray[Any, Any]) -> str:
-    """Return how many residuals lie beyond the axis, and the farthest; empty where none does."""
+    """Return how many residuals lie beyond the axis, and the farthest; empty where none does.
+
+    name : of the measurement
+    residual : (n,), standard deviations
+
+    >>> beyond_axis("MTF", np.array([0.5, -1.0]))
+    ''
+    """
     beyond = np.abs(residual) > RESIDUAL_SIGMA
     if not beyond.any():
         return ""
@@ -708,7 +752,7 @@ def _beside_residuals(said: str, colour: str, place: int) -> dict[str, Any]:
 
 
 def residual_curve(curve: ResidualCurve) -> Figure:
-    """One measurement with both models' predictions, and below it the residuals in standard deviations."""
+    """Draw one measurement with both models' predictions, and below it the residuals in standard deviations."""
     std = np.maximum(np.asarray(curve.measured_std), 1e-12)
     seen = np.asarray(curve.measured)
     notes: list[dict[str, Any]] = []
@@ -777,12 +821,12 @@ def residual_curve(curve: ResidualCurve) -> Figure:
 
 
 def held_out_bars(diagnosis: DiagnosisResult) -> Figure | None:
-    """chi2 / n of both models on held-out captures; noise alone gives 1."""
+    """Draw chi2 / n of both models on held-out captures; noise alone gives 1."""
     held = diagnosis.held_out
     if held is None or held.n == 0:
         return None
     every = (held.chi2_before, held.chi2_after, held.chi2_discovered)
-    left = [one / held.n for one in every if one is not None]
+    left = [chi2 / held.n for chi2 in every if chi2 is not None]
     return {
         "data": [
             {
@@ -791,7 +835,7 @@ def held_out_bars(diagnosis: DiagnosisResult) -> Figure | None:
                 "y": ["baseline", "improved model", "with laws without a name"][: len(left)],
                 "x": left,
                 "marker": {"color": [BEFORE, AFTER, AFTER][: len(left)]},
-                "text": [f"{one:.2f}" for one in left],
+                "text": [f"{ratio:.2f}" for ratio in left],
                 "textposition": "auto",
                 "showlegend": False,
             }
@@ -846,9 +890,10 @@ class ChartData:
         self._lines.append(figure_json(figure))
         return len(self._lines) - 1
 
-    def packed(self) -> str:
-        """All figures, a line of JSON each, compressed, as base64: no text of theirs can end the element that holds
-        it."""
+    def pack(self) -> str:
+        """Return all figures, a line of JSON each, compressed, as base64: no text of theirs can end the element that
+        holds it.
+        """
         return base64.b64encode(gzip.compress("\n".join(self._lines).encode(), mtime=0)).decode("ascii")
 
 
@@ -871,15 +916,15 @@ def _pack(values: Any) -> dict[str, str] | None:
 def figure_json(figure: Figure) -> str:
     """Return a figure as one line of JSON: a trace's numbers as typed arrays, others rounded to 7 digits."""
 
-    def rounded(value: Any, key: str = "") -> Any:
+    def round_numbers(value: Any, key: str = "") -> Any:
         if key in PACKED and (packed := _pack(value)) is not None:
             return packed
         if isinstance(value, dict):
-            return {name: rounded(item, name) for name, item in value.items()}
+            return {name: round_numbers(item, name) for name, item in value.items()}
         if isinstance(value, list | tuple):
-            return [rounded(item) for item in value]
+            return [round_numbers(item) for item in value]
         if isinstance(value, float):
             return float(f"{value:.7g}") if np.isfinite(value) else None
         return value
 
-    return json.dumps(rounded(figure), separators=(",", ":"), allow_nan=False)
+    return json.dumps(round_numbers(figure), separators=(",", ":"), allow_nan=False)

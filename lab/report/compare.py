@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lab.formats.results import Change, ComparisonResult, ProjectionChange
-from lab.formats.results.words import measured
+from lab.formats.results.words import format_value
 from lab.report import page_environment, write_page
 from lab.report.charts import AFTER, BEFORE, ChartData, Figure, axis, layout, log_axis, plotly_base64
 from lab.report.geometry import frame_layout, lines_of_vectors
@@ -30,7 +30,7 @@ def most_significant(comparison: ComparisonResult) -> tuple[Change, ...]:
 
 
 def significances(comparison: ComparisonResult) -> Figure | None:
-    """Significance of each difference in standard deviations, with the limit of the stated false-alarm rate."""
+    """Draw the significance of each difference in standard deviations, and the limit of the stated false-alarm rate."""
     rows = most_significant(comparison)[::-1]
     if not rows:
         return None
@@ -67,7 +67,7 @@ def significances(comparison: ComparisonResult) -> Figure | None:
 
 
 def projection_vectors(item: ProjectionChange) -> Figure:
-    """Differences of projection over the frame as enlarged lines, from A to B."""
+    """Draw the differences of projection over the frame as enlarged lines, from A to B."""
     x, y = np.meshgrid(item.x_px, item.y_px)
     at = np.stack([x.ravel(), y.ravel()], axis=1)
     shape = (item.y_px[-1] + 1, item.x_px[-1] + 1)
@@ -82,9 +82,9 @@ def render_comparison(comparison: ComparisonResult) -> str:
     rows: list[dict[str, Any]] = [
         {
             "change": row,
-            "a": measured(row.a, row.a_std),
-            "b": measured(row.b, row.b_std),
-            "difference": measured(row.difference, row.difference_std, row.unit),
+            "a": format_value(row.a, row.a_std),
+            "b": format_value(row.b, row.b_std),
+            "difference": format_value(row.difference, row.difference_std, row.unit),
         }
         for row in sorted(comparison.changes, key=lambda row: -row.significance_sigma)
     ]

@@ -82,9 +82,9 @@ def columns_of(result: object) -> Columns:
 def _(result: FitResult) -> Columns:
     """A row a figure: every fitted number that has a standard deviation."""
     rows = (
-        {"side": one.side, "figure": one.name, "place": one.place, "title": one.title}
-        | {"value": one.value, "std": one.std, "unit": one.unit}
-        for one in figures_of(result)
+        {"side": figure.side, "figure": figure.name, "place": figure.place, "title": figure.title}
+        | {"value": figure.value, "std": figure.std, "unit": figure.unit}
+        for figure in figures_of(result)
     )
     return _from_rows(rows, ("side", "figure", "place", "title", "value", "std", "unit"))
 
@@ -102,8 +102,8 @@ def _(result: DiagnosisResult) -> Columns:
         for effect in result.effects:
             named: dict[str, Any] = {"effect": effect.name, "family": effect.family, "law": effect.law}
             named |= {"probability": effect.probability, "sides": ", ".join(effect.sides)}
-            for name, found in effect.parameters.items():
-                yield named | {"parameter": name, "value": found.value, "std": found.std, "unit": found.unit}
+            for name, value in effect.parameters.items():
+                yield named | {"parameter": name, "value": value.value, "std": value.std, "unit": value.unit}
             if not effect.parameters:
                 yield named
 
@@ -125,8 +125,8 @@ def _(result: History) -> Columns:
 def _(result: SealedPrediction) -> Columns:
     rows = (
         {"side": side, "captures": " ".join(number.captures)} | _plain(number)
-        for side, one in result.sides.items()
-        for number in one.numbers
+        for side, side_prediction in result.sides.items()
+        for number in side_prediction.numbers
     )
     return _from_rows(rows, ("side", "quantity", "captures", "channel", "where", "x", "predicted", "std"))
 

@@ -19,7 +19,7 @@ from lab.formats.results import (
     ResidualPicture,
     Visibility,
 )
-from lab.formats.results.words import plain_number, shown_unit
+from lab.formats.results.words import format_unit, plain_number
 from lab.observables.observable import measurement_title, measurements
 from lab.report.charts import AFTER, CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.pictures import difference_picture
@@ -47,7 +47,7 @@ DEEPEST_SIGMA = 12.0
 
 
 def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[str, Any]:
-    """Variables of `diagnosis.html` besides the result itself."""
+    """Return the variables of `diagnosis.html` besides the result itself."""
     if diagnosis is None:
         return {}
     threshold = diagnosis.threshold
@@ -110,14 +110,14 @@ def _law_chart(law: DiscoveredLaw) -> Figure:
 def _by_channel(law: DiscoveredLaw) -> Figure:
     """Draw the curves of the channels over the time, with two standard deviations."""
     curves, half = (
-        factor * np.array(one).reshape(-1, len(law.at))
-        for factor, one in ((100.0, law.shown_departure), (200.0, law.shown_std))
+        factor * np.array(values).reshape(-1, len(law.at))
+        for factor, values in ((100.0, law.shown_departure), (200.0, law.shown_std))
     )
     data: list[Trace] = []
-    for own, std, name in zip(curves, half, ("R", "G", "B") if len(curves) == 3 else ("Y",), strict=True):
-        data.append(band(list(law.at), own, std, CHANNEL[name], mode="lines"))
+    for curve, std, name in zip(curves, half, ("R", "G", "B") if len(curves) == 3 else ("Y",), strict=True):
+        data.append(band(list(law.at), curve, std, CHANNEL[name], mode="lines"))
         data.append({
-            "type": "scatter", "mode": "lines", "x": list(law.at), "y": own.tolist(), "name": name,
+            "type": "scatter", "mode": "lines", "x": list(law.at), "y": curve.tolist(), "name": name,
             "line": {"color": CHANNEL[name], "width": 2},
         })  # fmt: skip
     return {"data": data, "layout": layout(220, xaxis=axis("time, s"), yaxis=axis("factor less 1, %"))}
@@ -130,11 +130,11 @@ def _of_measurement(law: DiscoveredLaw) -> Figure:
     x, departure, half = np.array(law.at), np.array(law.shown_departure), 2.0 * np.array(law.shown_std)
     data: list[Trace] = []
     for label in dict.fromkeys(law.labels):
-        own = [k for k, one in enumerate(law.labels) if one == label]
+        places = [k for k, of_label in enumerate(law.labels) if of_label == label]
         colour = CHANNEL.get(label.partition(" ")[0], "#888888")
-        data.append(band(x[own].tolist(), departure[own], half[own], colour))
+        data.append(band(x[places].tolist(), departure[places], half[places], colour))
         data.append({
-            "type": "scatter", "mode": "lines+markers", "x": x[own].tolist(), "y": departure[own].tolist(),
+            "type": "scatter", "mode": "lines+markers", "x": x[places].tolist(), "y": departure[places].tolist(),
             "name": label, "line": {"color": colour, "width": 2},
         })  # fmt: skip
     along = law.along if measurement is None else f"{measurement.axis.replace('_', ' ')}, {measurement.unit}"
@@ -156,7 +156,11 @@ def _cell_map(law: DiscoveredLaw) -> Figure:
 
 
 def mood(chi2: float, n: int) -> str:
-    """CSS class of a chi2's cell: marked above the 99.9 % quantile."""
+    """Return the CSS class of a chi2's cell: marked above the 99.9 % quantile of chi2 with n degrees of freedom.
+
+    >>> mood(200.0, 100), mood(100.0, 100)
+    ('open', '')
+    """
     return "open" if n and chi2 > special.chdtri(n, 1.0 - MARKED_QUANTILE) else ""
 
 
@@ -164,18 +168,18 @@ def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) ->
     """Return the curve of every measurement that the baseline fits worst, of held-out captures where there are any;
     worst first."""
 
-    def missed(curve: ResidualCurve) -> float:
+    def mean_chi2(curve: ResidualCurve) -> float:
         std = np.maximum(np.asarray(curve.measured_std), 1e-12)
         return float(np.mean(np.square((np.asarray(curve.measured) - np.asarray(curve.before)) / std)))
 
     chosen: dict[str, ResidualCurve] = {}
-    for curve in sorted(curves, key=lambda curve: (curve.held_out, missed(curve))):
+    for curve in sorted(curves, key=lambda curve: (curve.held_out, mean_chi2(curve))):
         chosen[curve.measurement] = curve
-    return sorted(chosen.values(), key=missed, reverse=True)[:most]
+    return sorted(chosen.values(), key=mean_chi2, reverse=True)[:most]
 
 
 def place_maps(diagnosis: DiagnosisResult, sides: Sequence[Side]) -> list[tuple[str, Figure]]:
-    """Heat maps of significance by measurement and axis, one for each side and model (baseline, and improved model
+    """Draw heat maps of significance by measurement and axis, one for each side and model (baseline, and improved model
     where effects were named)."""
     maps = []
     for side in sides:
@@ -289,12 +293,12 @@ def _visibility(items: Sequence[Visibility]) -> dict[str, dict[Side, _Detectable
     table: dict[str, dict[Side, _Detectable]] = {}
     for item in sorted(items, key=lambda item: item.effect):
         declared = library()[item.effect].quantities()
-        told = {
+        quantities = {
             told_as(name, quantity, gain_is_known=known): quantity
             for name, quantity in declared.items()
             for known in (True, False)
         }
-        units = {name: (unit, quantity) for (name, unit), quantity in told.items()}
+        units = {name: (unit, quantity) for (name, unit), quantity in quantities.items()}
         sizes = [_smallest_size(name, value, *units[name]) for name, value in item.smallest.items()]
         text = ", ".join(sizes) or "detectable at any magnitude"
         table.setdefault(item.effect, {})[item.side] = _Detectable(text, item.nearest, item.cosine, item.told_apart)
@@ -304,7 +308,7 @@ def _visibility(items: Sequence[Visibility]) -> dict[str, dict[Side, _Detectable
 def _smallest_size(name: str, value: float, unit: str, quantity: Quantity) -> str:
     """Return the least detectable size of a parameter, or that none within its bounds is detectable."""
     said = name.removesuffix("_" + ("percent" if unit == "%" else unit.lower())).replace("_", " ")
-    size = f"{plain_number(value, 2)} {shown_unit(unit)}".strip()
+    size = f"{plain_number(value, 2)} {format_unit(unit)}".strip()
     away = [abs(bound - (quantity.absent or 0.0)) for bound in (quantity.lower, quantity.upper) if bound is not None]
     if away and value > max(away):
         return f"{said}: not detectable below {size}, which is beyond its bounds"

@@ -17,7 +17,7 @@ from lab.errors import NotDetermined
 from lab.fit.noise.pixel_maps import pixel_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelNoise, Emva1288, Emva1288Points, FitResult, NoiseFit, PixelDefects
-from lab.formats.results.words import measured, plain_number
+from lab.formats.results.words import format_value, plain_number
 from lab.observables.darks.pixels import stack_of
 from lab.observables.flats.stated_light import light_of
 from lab.report.charts import AFTER, BEFORE, CHANNEL, Figure, Trace, axis, error_bars, layout, log_axis
@@ -39,7 +39,11 @@ class EmvaPlot:
 
 
 def markers(name: str, x: Sequence[float], y: Sequence[float], colour: str, **more: Any) -> Trace:
-    """Return a trace of markers; `more`: further keys of the trace."""
+    """Return a trace of markers; `more`: further keys of the trace.
+
+    >>> markers("darks", [0.0, 1.0], [64.0, 64.5], "#888888")["mode"]
+    'markers'
+    """
     return {
         "type": "scatter",
         "mode": "markers",
@@ -51,7 +55,11 @@ def markers(name: str, x: Sequence[float], y: Sequence[float], colour: str, **mo
 
 
 def curve(name: str, x: Sequence[float], y: Sequence[float], colour: str, dash: str = "solid", **more: Any) -> Trace:
-    """Return a trace of lines; `more`: further keys of the trace."""
+    """Return a trace of lines; `more`: further keys of the trace.
+
+    >>> curve("K", [0.0, 1.0], [0.0, 0.4], "#888888", "dot")["line"]["dash"]
+    'dot'
+    """
     return {
         "type": "scatter",
         "mode": "lines",
@@ -63,12 +71,19 @@ def curve(name: str, x: Sequence[float], y: Sequence[float], colour: str, dash: 
 
 
 def values_along(data: Sequence[Trace], key: str) -> list[float]:
-    """Return the coordinates `key` (x, y) of all traces, and the ends of their error bars."""
-    found = [float(value) for trace in data for value in trace[key]]
+    """Return the coordinates of all traces along an axis, and the ends of their error bars.
+
+    data : traces
+    key : `x` or `y`
+
+    >>> values_along([{"x": [1.0], "y": [5.0], "error_y": {"array": [0.5]}}], "y")
+    [5.0, 4.5, 5.5]
+    """
+    values = [float(value) for trace in data for value in trace[key]]
     for trace in data:
         std = trace.get(f"error_{key}", {}).get("array", [])
-        found += [value + sign * one for value, one in zip(trace[key], std, strict=False) for sign in (-1.0, 1.0)]
-    return found
+        values += [value + sign * half for value, half in zip(trace[key], std, strict=False) for sign in (-1.0, 1.0)]
+    return values
 
 
 def floats(values: NDArray[np.floating[Any]]) -> list[float]:
@@ -95,12 +110,12 @@ class _MeanImages:
     dark_step_dn: float  # between possible values of the mean dark image
 
 
-def spatial_plots(recordings: RecordingSet, side: Side, own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
-    """Yield the spatial plots of one plane, whose figures are `own`; none where its stacks aren't in the recordings."""
-    images = _stacks(recordings, side, own.points, plane)
+def spatial_plots(recordings: RecordingSet, side: Side, figures: Emva1288, plane: str) -> Iterator[EmvaPlot]:
+    """Yield the spatial plots of one plane with its `figures`; none where its stacks aren't in the recordings."""
+    images = _stacks(recordings, side, figures.points, plane)
     if images is None:
         return
-    gain = own.system_gain_dn_per_e
+    gain = figures.system_gain_dn_per_e
     dark = images.dark - images.dark.mean()
     yield _spectrogram("DSNU", dark / gain, images.dark_left_dn2 / gain**2, "e")
     bright = None
@@ -143,9 +158,17 @@ def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane:
 
 
 def spectrogram(image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (cycles/px) and rms amplitude along the rows of an image: the root of the mean power spectrum of its
-    rows, scaled so that a white pattern of standard deviation s has the amplitude s at every frequency. Frequency 0 is
-    left out."""
+    """Return frequencies (cycles/px) and rms amplitude along the rows of an image; frequency 0 is left out.
+
+    image : (rows, cols)
+
+    It is the root of the mean power spectrum of the rows, scaled so that a white pattern of standard deviation s has
+    the amplitude s at every frequency, as in the spectrograms of EMVA 1288.
+
+    >>> frequency, amplitude = spectrogram(np.random.default_rng(1).normal(0.0, 2.0, (500, 64)))
+    >>> bool(abs(np.sqrt(np.mean(amplitude[:-1] ** 2)) - 2.0) < 3.0 * 2.0 / np.sqrt(2.0 * 500 * 64))
+    True
+    """
     length = image.shape[1]
     power = np.mean(np.abs(np.fft.rfft(image - image.mean(), axis=1)) ** 2, axis=0) / length
     return np.asarray(np.fft.rfftfreq(length)[1:], float), np.asarray(np.sqrt(power[1:]), float)
@@ -234,7 +257,7 @@ def _histogram(name: str, image: FloatArray, left: float, unit: str, step: float
             ),
         },
         f"Mean image{', high-passed by 5 × 5 means' if name == 'PRNU' else ''}; residual temporal noise "
-        f"{measured(float(np.sqrt(left)), None, unit)}. "
+        f"{format_value(float(np.sqrt(left)), None, unit)}. "
         "Defective pixels lie outside the normal distribution.",
     )
 
@@ -287,14 +310,14 @@ def _light_axis(points: Emva1288Points) -> str:
     return "irradiation, photons/pixel" if points.light_unit == "photons" else "exposure, s"
 
 
-def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
-    """Yield the temporal plots of one plane, whose figures are `own`."""
-    points, colour = own.points, CHANNEL.get(plane, "#888888")
+def temporal_plots(figures: Emva1288, plane: str) -> Iterator[EmvaPlot]:
+    """Yield the temporal plots of one plane with its `figures`."""
+    points, colour = figures.points, CHANNEL.get(plane, "#888888")
     signal = np.array(points.mean_dn) - np.array(points.dark_mean_dn)
     excess = np.array(points.variance_dn2) - np.array(points.dark_variance_dn2)
     light = np.array(points.light)
-    saturation = own.saturation_capacity_e
-    top = saturation * own.system_gain_dn_per_e if saturation is not None else float(signal.max())
+    saturation = figures.saturation_capacity_e
+    top = saturation * figures.system_gain_dn_per_e if saturation is not None else float(signal.max())
     yield EmvaPlot(
         "Photon transfer",
         {
@@ -308,15 +331,15 @@ def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
                     error_y=error_bars(points.excess_variance_dn2_std, colour),
                 ),
                 curve(
-                    f"K = {measured(own.system_gain_dn_per_e, own.system_gain_dn_per_e_std, 'DN/e')}",
+                    f"K = {format_value(figures.system_gain_dn_per_e, figures.system_gain_dn_per_e_std, 'DN/e')}",
                     [0.0, 0.7 * top],
-                    [0.0, 0.7 * top * own.system_gain_dn_per_e],
+                    [0.0, 0.7 * top * figures.system_gain_dn_per_e],
                     "@fg",
                 ),
                 curve(
                     "",
                     [0.7 * top, top],
-                    [k * top * own.system_gain_dn_per_e for k in (0.7, 1.0)],
+                    [k * top * figures.system_gain_dn_per_e for k in (0.7, 1.0)],
                     "@fg",
                     "dot",
                     showlegend=False,
@@ -331,8 +354,8 @@ def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
         "Temporal variance against mean, dark subtracted. Solid: the line through the origin, fitted to 70 % of "
         "saturation; dotted: beyond.",
     )
-    if own.responsivity_dn_per_photon is not None:
-        slope = own.responsivity_dn_per_photon
+    if figures.responsivity_dn_per_photon is not None:
+        slope = figures.responsivity_dn_per_photon
         reach = float(light[signal <= 1.02 * top].max())
         yield EmvaPlot(
             "Responsivity",
@@ -346,7 +369,7 @@ def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
                         error_y=error_bars(points.signal_dn_std, colour),
                     ),
                     curve(
-                        f"R = {measured(slope, own.responsivity_dn_per_photon_std, 'DN/photon')}",
+                        f"R = {format_value(slope, figures.responsivity_dn_per_photon_std, 'DN/photon')}",
                         [0.0, reach],
                         [0.0, slope * reach],
                         "@fg",
@@ -360,24 +383,24 @@ def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
             },
             "Mean minus dark against photons, with the line through the origin, fitted to 70 % of saturation.",
         )
-    yield _snr(own, light, signal, colour)
-    yield from _linearity(own, light, signal, colour)
-    yield from _dark_current(own, colour)
+    yield _snr(figures, light, signal, colour)
+    yield from _linearity(figures, light, signal, colour)
+    yield from _dark_current(figures, colour)
 
 
-def _snr(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> EmvaPlot:
+def _snr(figures: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> EmvaPlot:
     """SNR against light: measured, of the linear model, with nonuniformity, and of an ideal sensor."""
-    points, gain = own.points, own.system_gain_dn_per_e
-    photons = own.quantum_efficiency is not None
-    efficiency = own.quantum_efficiency if own.quantum_efficiency is not None else 1.0
+    points, gain = figures.points, figures.system_gain_dn_per_e
+    photons = figures.quantum_efficiency is not None
+    efficiency = figures.quantum_efficiency if figures.quantum_efficiency is not None else 1.0
     x = light if photons else signal / gain
     # beyond saturation the noise vanishes, and SNR has no meaning
     seen = (signal > 0) & (np.array(points.variance_dn2) > 0)
-    if own.saturation_capacity_e is not None:
+    if figures.saturation_capacity_e is not None:
         seen &= (
-            signal <= 1.001 * own.saturation_capacity_e * gain
+            signal <= 1.001 * figures.saturation_capacity_e * gain
             if not photons
-            else light <= (own.saturation_capacity_photons or np.inf)
+            else light <= (figures.saturation_capacity_photons or np.inf)
         )
     noise = np.sqrt(np.where(seen, points.variance_dn2, 1.0))
     snr, snr_std = signal[seen] / noise[seen], np.zeros(int(seen.sum()))
@@ -385,9 +408,9 @@ def _snr(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> E
         of_signal = np.array(points.signal_dn_std)[seen] / signal[seen]
         of_variance = np.array(points.excess_variance_dn2_std)[seen] / noise[seen] ** 2
         snr_std = snr * np.hypot(of_signal, 0.5 * of_variance)
-    dark_e = own.temporal_dark_noise_dn / gain if own.temporal_dark_noise_dn is not None else 0.0
-    first = own.sensitivity_threshold_photons if photons else own.sensitivity_threshold_e
-    full = own.saturation_capacity_photons if photons else own.saturation_capacity_e
+    dark_e = figures.temporal_dark_noise_dn / gain if figures.temporal_dark_noise_dn is not None else 0.0
+    first = figures.sensitivity_threshold_photons if photons else figures.sensitivity_threshold_e
+    full = figures.saturation_capacity_photons if photons else figures.saturation_capacity_e
     low, high = first or 1.0, full or float(x.max())
     at = np.geomspace(max(0.7 * low, 1e-3), high, 60)
     electrons = efficiency * at
@@ -396,8 +419,8 @@ def _snr(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> E
         markers("measured", floats(x[seen]), floats(snr), colour, error_y=error_bars(floats(snr_std), colour)),
         curve("linear model", floats(at), floats(model), "@fg"),
     ]
-    if own.dsnu_e is not None and own.prnu_percent is not None:
-        spatial = own.dsnu_e**2 + (own.prnu_percent / 100.0 * electrons) ** 2
+    if figures.dsnu_e is not None and figures.prnu_percent is not None:
+        spatial = figures.dsnu_e**2 + (figures.prnu_percent / 100.0 * electrons) ** 2
         total = electrons / np.sqrt(dark_e**2 + electrons + spatial)
         data.append(curve("total, with nonuniformity", floats(at), floats(total), BEFORE))
     data.append(curve("ideal sensor", floats(at), floats(np.sqrt(at)), "@muted", "dash"))
@@ -425,10 +448,10 @@ def _snr(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> E
     )
 
 
-def _linearity(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> Iterator[EmvaPlot]:
-    points = own.points
+def _linearity(figures: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> Iterator[EmvaPlot]:
+    points = figures.points
     at = [k for k, value in enumerate(points.linearity_deviation_percent) if value is not None]
-    if not at or own.linearity_error_percent is None:
+    if not at or figures.linearity_error_percent is None:
         return
     deviation = [points.linearity_deviation_percent[k] for k in at]
     x = light[at]
@@ -464,13 +487,13 @@ def _linearity(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str
             ),
         },
         f"Above: mean minus dark with the line that minimises relative deviations; below: the deviations. "
-        f"LE {measured(own.linearity_error_percent, own.linearity_error_percent_std, '%')} is their mean absolute "
-        "value.",
+        f"LE {format_value(figures.linearity_error_percent, figures.linearity_error_percent_std, '%')} is their mean "
+        "absolute value.",
     )
 
 
-def _dark_current(own: Emva1288, colour: str) -> Iterator[EmvaPlot]:
-    points = own.points
+def _dark_current(figures: Emva1288, colour: str) -> Iterator[EmvaPlot]:
+    points = figures.points
     if len(set(points.dark_exposure_s)) < 2:
         return
     yield EmvaPlot(
@@ -508,7 +531,7 @@ def _dark_current(own: Emva1288, colour: str) -> Iterator[EmvaPlot]:
 
 
 def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
-    """Plots of the joint fit: read noise of single pixels, dark current against temperature."""
+    """Yield the plots of the joint fit: read noise of single pixels, dark current against temperature."""
     spread = noise.read_noise_distribution
     if spread is not None:
         edges = np.array(spread.noise_e)
@@ -534,7 +557,7 @@ def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
             },
             f"Over {spread.degrees_of_freedom} degrees of freedom a pixel; median {spread.median_e:.3g} e, 99 % below "
             f"{spread.percentile_99_e:.3g} e. The pixels' true variances differ by "
-            f"{measured(spread.spread_percent, spread.spread_percent_std, '%')}, sampling error subtracted; "
+            f"{format_value(spread.spread_percent, spread.spread_percent_std, '%')}, sampling error subtracted; "
             f"{spread.noisy_pixels} noisy pixels.",
             of_plane=False,
         )
@@ -562,9 +585,11 @@ def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
         reference_k = (law.reference_temperature_c or 0.0) + ZERO_C_K
         exponent = law.activation_energy_ev / BOLTZMANN_EV_PER_K * (1.0 / reference_k - 1.0 / (at + ZERO_C_K))
         data.append(curve("Arrhenius", floats(at), floats(law.reference_current_e_per_s * np.exp(exponent)), "@fg"))
-        caption += f" Activation energy {measured(law.activation_energy_ev, law.activation_energy_ev_std, 'eV')}"
+        caption += f" Activation energy {format_value(law.activation_energy_ev, law.activation_energy_ev_std, 'eV')}"
         if law.doubling_temperature_c is not None:
-            caption += f"; doubles every {measured(law.doubling_temperature_c, law.doubling_temperature_c_std, 'K')}"
+            caption += (
+                f"; doubles every {format_value(law.doubling_temperature_c, law.doubling_temperature_c_std, 'K')}"
+            )
         caption += "."
     yield EmvaPlot(
         "Dark current against temperature",
@@ -648,11 +673,11 @@ def data_sheets(recordings: RecordingSet, fit: FitResult) -> Iterator[EmvaSheet]
         noise = camera.noise
         if noise is None or not noise.emva1288:
             continue
-        found = noise.emva1288
-        names = tuple(found)
-        plotted = next(name for name in ("Y", "G1", *names) if name in found)
-        own = found[plotted]
-        remarks = [(name, remark) for name, plane in found.items() for remark in plane.remarks]
+        figures_of_plane = noise.emva1288
+        names = tuple(figures_of_plane)
+        plotted = next(name for name in ("Y", "G1", *names) if name in figures_of_plane)
+        plotted_figures = figures_of_plane[plotted]
+        remarks = [(name, remark) for name, plane in figures_of_plane.items() for remark in plane.remarks]
         grouped: dict[str, list[str]] = {}
         for name, remark in remarks:
             grouped.setdefault(remark, []).append(name)
@@ -660,11 +685,11 @@ def data_sheets(recordings: RecordingSet, fit: FitResult) -> Iterator[EmvaSheet]
             side=side,
             planes=names,
             plotted=plotted,
-            conditions=tuple(_conditions(recordings, side, own)),
-            rows=tuple(table_rows(found)),
+            conditions=tuple(_conditions(recordings, side, plotted_figures)),
+            rows=tuple(table_rows(figures_of_plane)),
             plots=(
-                *temporal_plots(own, plotted),
-                *spatial_plots(recordings, side, own, plotted),
+                *temporal_plots(plotted_figures, plotted),
+                *spatial_plots(recordings, side, plotted_figures, plotted),
                 *joint_fit_plots(noise),
             ),
             remarks=(
@@ -709,33 +734,34 @@ def compare_estimates(noise: NoiseFit) -> Iterator[str]:
     """Yield by how much the standard's figures and the joint fit's differ, in per cent and in combined standard
     deviations (which are too large where both use the same noise), and why they may: the system gain always, the
     others where they are apart."""
-    for plane, own in noise.emva1288.items():
+    for plane, figures in noise.emva1288.items():
         joint = noise.channels.get(plane[0], noise)
-        for field, (other, why) in BOTH_ESTIMATES.items():
-            scale = 10.0 ** ((noise.gain_db or 0.0) / 20.0) if other == "conversion_gain_dn_per_e" else 1.0
-            first, first_std = getattr(own, field), getattr(own, f"{field}_std")
-            source = joint if other in type(joint).model_fields else noise
-            second, second_std = getattr(source, other), getattr(source, f"{other}_std")
+        for field, (field_of_fit, why) in BOTH_ESTIMATES.items():
+            scale = 10.0 ** ((noise.gain_db or 0.0) / 20.0) if field_of_fit == "conversion_gain_dn_per_e" else 1.0
+            first, first_std = getattr(figures, field), getattr(figures, f"{field}_std")
+            source = joint if field_of_fit in type(joint).model_fields else noise
+            second, second_std = getattr(source, field_of_fit), getattr(source, f"{field_of_fit}_std")
             if not first or not second or not first_std or not second_std:
                 continue
             second, second_std = scale * second, scale * second_std
             sigma = abs(first - second) / float(np.hypot(first_std, second_std))
             if sigma < APART_SIGMA and field != "system_gain_dn_per_e":
                 continue
-            name, unit = NOISE[other]
+            name, unit = NOISE[field_of_fit]
             yield (
-                f"two estimates of the {name} ({plane}): EMVA 1288 {measured(first, first_std, unit)}, joint fit "
-                f"{measured(second, second_std, unit)}, {_percent(first / second - 1.0)} % or {sigma:.1f} combined "
+                f"two estimates of the {name} ({plane}): EMVA 1288 {format_value(first, first_std, unit)}, joint fit "
+                f"{format_value(second, second_std, unit)}, {_percent(first / second - 1.0)} % or {sigma:.1f} combined "
                 f"standard deviations apart: {why}"
             )
-        mean, variance = own.dark_current_from_mean_e_per_s, own.dark_current_from_variance_e_per_s
-        stds = own.dark_current_from_mean_e_per_s_std, own.dark_current_from_variance_e_per_s_std
+        mean, variance = figures.dark_current_from_mean_e_per_s, figures.dark_current_from_variance_e_per_s
+        stds = figures.dark_current_from_mean_e_per_s_std, figures.dark_current_from_variance_e_per_s_std
         if mean is not None and variance is not None and stds[0] is not None and stds[1] is not None:
             sigma = abs(mean - variance) / float(np.hypot(stds[0], stds[1]))
             if sigma >= APART_SIGMA:
                 yield (
-                    f"two estimates of the dark current ({plane}): from means {measured(mean, stds[0], 'e/s')}, from "
-                    f"variances {measured(variance, stds[1], 'e/s')}, {sigma:.1f} combined standard deviations apart: "
+                    f"two estimates of the dark current ({plane}): from means {format_value(mean, stds[0], 'e/s')}, "
+                    f"from variances {format_value(variance, stds[1], 'e/s')}, {sigma:.1f} combined standard "
+                    "deviations apart: "
                     "a black level that follows the exposure moves the means alone, excess noise the variances alone"
                 )
 
@@ -745,17 +771,17 @@ def _percent(share: float) -> str:
     return f"{'-' if share < 0 else '+'}{plain_number(abs(100.0 * share), 2)}"
 
 
-def table_rows(found: dict[str, Emva1288]) -> Iterator[EmvaRow]:
+def table_rows(figures_of_plane: dict[str, Emva1288]) -> Iterator[EmvaRow]:
     """Yield the quantities that at least one plane has, with standard deviations."""
     for field, (quantity, symbol, unit, factor) in TABLE.items():
         texts = []
-        for plane in found.values():
+        for plane in figures_of_plane.values():
             value, std = getattr(plane, field), getattr(plane, f"{field}_std")
             if value is None:
                 limit = plane.temporal_dark_noise_limit_e if field == "temporal_dark_noise_e" else None
                 texts.append("–" if limit is None else f"below {limit:.3g} e")
                 continue
-            text = measured(factor * value, None if std is None else factor * std, unit)
+            text = format_value(factor * value, None if std is None else factor * std, unit)
             if field in DECIBELS and value > 0:
                 text += f" ({20.0 * np.log10(value):.1f} dB, {np.log2(value):.1f} bit)"
             systematic = getattr(plane, f"{field}_systematic_std", None)
@@ -774,7 +800,7 @@ def _channel_rows(noise: NoiseFit) -> Iterator[EmvaRow]:
         values = [getattr(channel, field) for channel in noise.channels.values()]
         stds = [getattr(channel, f"{field}_std") for channel in noise.channels.values()]
         if any(value is not None for value in values):
-            texts = ("–" if v is None else measured(v, std, unit) for v, std in zip(values, stds, strict=True))
+            texts = ("–" if v is None else format_value(v, std, unit) for v, std in zip(values, stds, strict=True))
             yield EmvaRow(name, "", tuple(texts))
 
 
@@ -793,13 +819,13 @@ def _defect_sentence(defects: PixelDefects | None) -> str:
     )
 
 
-def _conditions(recordings: RecordingSet, side: Side, own: Emva1288) -> Iterator[str]:
-    camera, points = recordings.camera(side), own.points
+def _conditions(recordings: RecordingSet, side: Side, figures: Emva1288) -> Iterator[str]:
+    camera, points = recordings.camera(side), figures.points
     yield f"{camera.cols} × {camera.rows} pixels, {camera.bit_depth} bit, mosaic {camera.cfa}"
     if camera.pixel_pitch_um is not None:
         yield f"pixel pitch {camera.pixel_pitch_um:g} µm"
-    if own.wavelength_nm is not None:
-        yield f"light of {own.wavelength_nm:g} nm"
+    if figures.wavelength_nm is not None:
+        yield f"light of {figures.wavelength_nm:g} nm"
     elif points.light_unit == "photons":
         yield "wavelength of the light not stated"
     else:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
-from lab.formats.results.words import measured, plain_name, unit_of
+from lab.formats.results.words import format_value, plain_name, unit_of
 from sim.camera import Side
 from sim.scene.projection import Projection
 
@@ -52,12 +52,12 @@ class KeyFigure:
     @property
     def text(self) -> str:
         """The value and its standard deviation with unit and note: `0.383 ± 0.008 at 610 nm`."""
-        told = f"{measured(self.value, self.std, self.unit)} {self.note}".rstrip()
-        return told if self.is_determined else f"not determined ({told})"
+        text = f"{format_value(self.value, self.std, self.unit)} {self.note}".rstrip()
+        return text if self.is_determined else f"not determined ({text})"
 
 
 def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[KeyFigure]:
-    """Results of the photon transfer, with the maker's values."""
+    """Yield results of the photon transfer, with the maker's values."""
     for field, (name, unit) in NOISE.items():
         value = getattr(noise, field)
         if value is None:
@@ -71,15 +71,19 @@ def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[
 
 
 def mtf50_range(curves: tuple[MtfCurve, ...], channel: str) -> tuple[float, float, int] | None:
-    """(lowest, highest, number) of one channel's MTF50 over all edges, cy/px; None where no edge has one."""
-    found = [
+    """Return (lowest, highest, number) of one channel's MTF50 over all edges, cy/px; None where no edge has one.
+
+    >>> mtf50_range((), "G") is None
+    True
+    """
+    mtf50 = [
         curve.mtf50_cy_per_px for curve in curves if curve.channel == channel and curve.mtf50_cy_per_px is not None
     ]
-    return (min(found), max(found), len(found)) if found else None
+    return (min(mtf50), max(mtf50), len(mtf50)) if mtf50 else None
 
 
 def camera_figures(fit: CameraFit, camera: DataSheet | None = None) -> Iterator[KeyFigure]:
-    """All key figures of one camera."""
+    """Yield all key figures of one camera."""
     if fit.noise is not None:
         yield from noise_figures(fit.noise, camera)
     if fit.spectral is not None:
@@ -109,7 +113,7 @@ def camera_figures(fit: CameraFit, camera: DataSheet | None = None) -> Iterator[
 
 
 def geometry_figures(geometry: GeometryFit) -> Iterator[KeyFigure]:
-    """Camera matrix and distortion of the fitted projection."""
+    """Yield camera matrix and distortion of the fitted projection."""
     matrix, matrix_std = geometry.camera_matrix, geometry.camera_matrix_std
     for place, row, col in (("fx", 0, 0), ("fy", 1, 1), ("cx", 0, 2), ("cy", 1, 2)):
         yield KeyFigure(
@@ -123,7 +127,7 @@ def geometry_figures(geometry: GeometryFit) -> Iterator[KeyFigure]:
 
 
 def stereo_figures(stereo: StereoFit) -> Iterator[KeyFigure]:
-    """Baseline, translation and rotation of the pair."""
+    """Yield baseline, translation and rotation of the pair."""
     yield KeyFigure("stereo baseline", "mm", stereo.baseline_mm, stereo.baseline_mm_std)
     for name, value, number in zip("xyz", stereo.translation_mm, range(3), strict=True):
         std = stereo.translation_mm_std
@@ -137,7 +141,12 @@ def stereo_figures(stereo: StereoFit) -> Iterator[KeyFigure]:
 
 
 def rotation_vector_mrad(rotation: tuple[tuple[float, float, float], ...]) -> tuple[float, float, float]:
-    """Rotation vector (axis times angle, mrad) of a rotation matrix, for the small rotations of a stereo pair."""
+    """Return the rotation vector (axis times angle, mrad) of a rotation matrix (3, 3), for small rotations of a stereo
+    pair.
+
+    >>> rotation_vector_mrad(((1.0, -0.001, 0.0), (0.001, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    (0.0, 0.0, 1.0)
+    """
     cosine = min(1.0, max(-1.0, (rotation[0][0] + rotation[1][1] + rotation[2][2] - 1) / 2))
     angle = math.acos(cosine)
     scale = 500.0 if angle < 1e-8 else 500.0 * angle / math.sin(angle)
@@ -149,7 +158,9 @@ def rotation_vector_mrad(rotation: tuple[tuple[float, float, float], ...]) -> tu
 
 
 def by_side(fit: FitResult, cameras: dict[Side, DataSheet]) -> list[tuple[str, dict[Side, KeyFigure]]]:
-    """Rows of the table of key figures: name -> figure of each side, in the order of the first side that has it."""
+    """Return the rows of the table of key figures: name -> figure of each side, in the order of the first side that has
+    it.
+    """
     names: list[str] = []
     rows: dict[str, dict[Side, KeyFigure]] = {}
     for side, camera_fit in fit.cameras.items():

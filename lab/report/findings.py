@@ -35,7 +35,7 @@ class DiagnosisFindings(Frozen):
 WORTH_A_PICTURE = 0.1
 
 
-def _taken_away(picture: ResidualPicture) -> float:
+def _explained_share(picture: ResidualPicture) -> float:
     """Return the share of the rms residual that the named effects take away."""
     before, after = (float(np.sqrt(np.nanmean(np.square(cells)))) for cells in (picture.before, picture.after))
     return 1.0 - after / max(before, 1e-12)
@@ -49,8 +49,8 @@ def _proof(curve: ResidualCurve) -> ProofCurve:
 def findings(fit: FitResult, validation: ValidationResult | None, diagnosis: DiagnosisResult) -> DiagnosisFindings:
     """Return what is told of a diagnosis, and of the fit and the validation that go with it."""
     verdict, _, headline = words.headline(diagnosis)
-    told = [picture for picture in diagnosis.pictures if _taken_away(picture) >= WORTH_A_PICTURE]
-    best = {picture.side: picture for picture in sorted(told, key=_taken_away)}
+    shown = [picture for picture in diagnosis.pictures if _explained_share(picture) >= WORTH_A_PICTURE]
+    best = {picture.side: picture for picture in sorted(shown, key=_explained_share)}
     return DiagnosisFindings(
         verdict=verdict,
         headline=headline,

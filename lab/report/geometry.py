@@ -15,7 +15,7 @@ from lab.errors import InputError, NotDetermined
 from lab.fit.stereo import rectification_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelGeometry, DepthUncertainty, GeometryFit, ProjectionUncertainty, StereoFit
-from lab.formats.results.words import PROJECTION_NAMES, measured
+from lab.formats.results.words import PROJECTION_NAMES, format_value
 from lab.observables.boards.detection import luminance
 from lab.report.charts import CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.pictures import photograph_data_uri
@@ -57,7 +57,7 @@ def frame_layout(shape: tuple[float, float]) -> dict[str, Any]:
 
 
 def coverage(geometry: GeometryFit) -> Figure | None:
-    """Corners of each view in the frame, with their convex hull."""
+    """Draw the corners of each view in the frame, with their convex hull."""
     if not geometry.residuals:
         return None
     data: list[Trace] = []
@@ -96,11 +96,21 @@ def coverage(geometry: GeometryFit) -> Figure | None:
 
 
 def lines_of_vectors(at: FloatArray, vector: FloatArray, shape: tuple[float, float], name: str) -> list[Trace]:
-    """Vectors (n, 2) at positions (n, 2) in a frame of `shape` (rows, cols), x and y in px, drawn as lines enlarged by
-    a round number."""
+    """Draw vectors in a frame as lines, enlarged by a round number.
+
+    at, vector : places and vectors, (n, 2), x and y in px
+    shape : rows and columns of the frame
+    name : of the trace, to which the factor is added
+
+    Returns two traces: the lines and the places.
+
+    >>> lines, places = lines_of_vectors(np.array([[10.0, 20.0]]), np.array([[0.1, 0.0]]), (480.0, 640.0), "residuals")
+    >>> places["x"], places["y"]
+    ([10.0], [20.0])
+    """
     usual = max(float(np.percentile(np.linalg.norm(vector, axis=1), 95)), 1e-9)
     wanted = ARROWS * shape[1] / usual
-    scale = max([one for one in SCALES if one <= wanted], default=SCALES[0])
+    scale = max([factor for factor in SCALES if factor <= wanted], default=SCALES[0])
     ends = at + scale * vector
     lines = np.stack([at, ends, np.full_like(at, np.nan)], axis=1).reshape(-1, 2)
     return [
@@ -127,7 +137,7 @@ def lines_of_vectors(at: FloatArray, vector: FloatArray, shape: tuple[float, flo
 
 
 def residual_vectors(geometry: GeometryFit) -> Figure | None:
-    """Reprojection residuals of all corners, measured minus predicted, as enlarged lines."""
+    """Draw the reprojection residuals of all corners, measured minus predicted, as enlarged lines."""
     if not geometry.residuals:
         return None
     at = np.array([(x, y) for view in geometry.residuals for x, y in zip(view.x_px, view.y_px, strict=True)])
@@ -149,7 +159,7 @@ def _map(
     if wide:
         decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
         ticks = [m * 10.0**d for d in decades for m in (1, 2, 5) if low <= m * 10.0**d <= high]
-        bar |= {"tickvals": [float(np.log10(one)) for one in ticks], "ticktext": [f"{one:g}" for one in ticks]}
+        bar |= {"tickvals": [float(np.log10(value)) for value in ticks], "ticktext": [f"{value:g}" for value in ticks]}
     return {
         "data": [
             {
@@ -172,13 +182,13 @@ def _map(
 
 
 def projection_map(uncertainty: ProjectionUncertainty) -> Figure:
-    """Standard deviation of the projection over the frame."""
+    """Draw the standard deviation of the projection over the frame."""
     rows: list[list[float | None]] = [list(row) for row in uncertainty.projection_px_std]
     return _map(uncertainty.x_px, uncertainty.y_px, rows, "px", ".2g")
 
 
 def depth_map(depth: DepthUncertainty) -> Figure | None:
-    """Standard deviation of a depth over the left camera's frame."""
+    """Draw the standard deviation of a depth over the left camera's frame."""
     rows = [list(row) for row in depth.total_mm_std]
     if not any(value is not None for row in rows for value in row):
         return None
@@ -186,8 +196,9 @@ def depth_map(depth: DepthUncertainty) -> Figure | None:
 
 
 def lateral_colour(channels: tuple[ChannelGeometry, ...]) -> Figure | None:
-    """Radial shift of red and blue relative to green over the distance from the principal point, with a band of two
-    standard deviations."""
+    """Draw the radial shift of red and blue relative to green over the distance from the principal point, with a band
+    of two standard deviations.
+    """
     drawn = [channel for channel in channels if channel.radius_px]
     if not drawn:
         return None
@@ -217,7 +228,7 @@ def lateral_colour(channels: tuple[ChannelGeometry, ...]) -> Figure | None:
 
 
 def facts(geometry: GeometryFit) -> list[tuple[str, str]]:
-    """Further results of a fit as rows of a table."""
+    """Return further results of a fit as rows of a table."""
     rows: list[tuple[str, str]] = []
     if geometry.corner_px_std is not None:
         noise = f", {geometry.corner_noise_px:.4f} px expected from image noise" if geometry.corner_noise_px else ""
@@ -230,18 +241,18 @@ def facts(geometry: GeometryFit) -> list[tuple[str, str]]:
                 f"{parts_px.noise_px:.4f} px (sampling error); {parts_px.model_error_px:.4f} px (model error)",
             )
         )
-    own = geometry.cross_validation
-    if own is not None:
-        error = f"model error {own.model_error_px:.3f} px" if own.model_error_px > 0 else "no model error"
+    halves = geometry.cross_validation
+    if halves is not None:
+        error = f"model error {halves.model_error_px:.3f} px" if halves.model_error_px > 0 else "no model error"
         rows.append(
             (
                 "cross-validation of two halves of the views",
-                f"{own.difference_px:.4f} px difference, {own.expected_px:.4f} px expected: {error}",
+                f"{halves.difference_px:.4f} px difference, {halves.expected_px:.4f} px expected: {error}",
             )
         )
     for warp in geometry.board_warp:
         parts = [
-            f"{name} {measured(value, std, 'mm')}"
+            f"{name} {format_value(value, std, 'mm')}"
             for name, value, std in (
                 ("bend x", warp.bend_x_mm, warp.bend_x_mm_std),
                 ("bend y", warp.bend_y_mm, warp.bend_y_mm_std),
@@ -252,7 +263,7 @@ def facts(geometry: GeometryFit) -> list[tuple[str, str]]:
         rows.append((f"warp of the board ({warp.board})", ", ".join(parts) or "not determined"))
     for channel in geometry.channels:
         if channel.radius_px:
-            shift = measured(channel.radial_shift_px[-1], channel.radial_shift_px_std[-1], "px")
+            shift = format_value(channel.radial_shift_px[-1], channel.radial_shift_px_std[-1], "px")
             at = f"at {channel.radius_px[-1]:.0f} px from the principal point"
             rows.append((f"lateral colour, {channel.channel} − G", f"{shift} {at}"))
     rows += [
@@ -266,7 +277,7 @@ def facts(geometry: GeometryFit) -> list[tuple[str, str]]:
 
 
 def draw_rectified(recordings: RecordingSet, stereo: StereoFit, width_px: int = 1200) -> tuple[str, str] | None:
-    """Both cameras' images of one pose, rectified, side by side with lines along the rows; and the pose's name."""
+    """Draw both cameras' images of one pose, rectified, side by side with lines along the rows; and the pose's name."""
     try:
         sides: tuple[Side, Side] = ("left", "right")
         left, right = (
@@ -297,7 +308,7 @@ def draw_rectified(recordings: RecordingSet, stereo: StereoFit, width_px: int = 
 
 
 def context(geometry: GeometryFit | None) -> dict[str, Any]:
-    """Variables of the page for one camera, besides its key figures."""
+    """Return the variables of the page for one camera, besides its key figures."""
     if geometry is None:
         return {}
     return {
@@ -309,7 +320,7 @@ def context(geometry: GeometryFit | None) -> dict[str, Any]:
 
 
 def charts_by_side(fits: Mapping[Side, GeometryFit | None]) -> list[tuple[str, dict[Side, Figure | None], str]]:
-    """Title, figure of each side, and caption of each chart of the cameras."""
+    """Return title, figure of each side, and caption of each chart of the cameras."""
 
     def of(draw: Callable[[GeometryFit], Figure | None]) -> dict[Side, Figure | None]:
         return {side: draw(fit) if fit is not None else None for side, fit in fits.items()}
@@ -318,25 +329,25 @@ def charts_by_side(fits: Mapping[Side, GeometryFit | None]) -> list[tuple[str, d
         return lambda fit: projection_map(fit.projection[place]) if len(fit.projection) > place else None
 
     known = next((fit.projection for fit in fits.values() if fit is not None and fit.projection), ())
-    found = [
+    rows = [
         ("Coverage by the boards", of(coverage), "Corners of each view in the frame, and their convex hull."),
         ("Reprojection residuals, measured − predicted", of(residual_vectors), ""),
     ]
-    for place, one in enumerate(known):
-        where = "at infinity" if one.distance_mm is None else "at the boards' distance"
+    for place, projection in enumerate(known):
+        where = "at infinity" if projection.distance_mm is None else "at the boards' distance"
         caption = (
             "Standard deviation in the worst direction; the rigid motion that the corners can't separate from the "
             "intrinsics is removed."
         )
-        found.append(
+        rows.append(
             (f"Uncertainty of the projection, {where}", of(at(place)), caption if place == len(known) - 1 else "")
         )
-    found.append(("Lateral colour", of(lambda fit: lateral_colour(fit.channels)), "Bands: two standard deviations."))
-    return found
+    rows.append(("Lateral colour", of(lambda fit: lateral_colour(fit.channels)), "Bands: two standard deviations."))
+    return rows
 
 
 def stereo_context(recordings: RecordingSet, stereo: StereoFit | None) -> dict[str, Any]:
-    """Variables of the page for the pair: depth maps and a rectified pose."""
+    """Return the variables of the page for the pair: depth maps and a rectified pose."""
     if stereo is None:
         return {"depth": [], "rectified": None, "row_rms_px": None, "rejected": (), "remarks": ()}
     return {

@@ -60,7 +60,7 @@ def _paths(system: OpticalSystem, tangent: tuple[float, float]) -> list[FloatArr
 
 
 def drawing(system: OpticalSystem, tangents: list[tuple[float, float]]) -> Figure:
-    """Section of the lens in the y-z plane, to scale, with the rays of three field points."""
+    """Draw a section of the lens in the y-z plane, to scale, with the rays of three field points."""
     surfaces, prescription = system.surfaces, system.prescription
     vertices, axes = rt.frames(surfaces)
     rays = [_paths(system, tangent) for tangent in tangents]
@@ -136,7 +136,7 @@ def _spectral(table: LensTable) -> list[tuple[int, str]]:
 
 
 def illumination(table: LensTable) -> Figure:
-    """Relative illumination against the field angle, with cos^4 beside it."""
+    """Draw relative illumination against the field angle, with cos^4 beside it."""
     angle = table.field_deg[:, 1].tolist()
     traces = [
         _curve(f"{table.wavelength_nm[i]:.0f} nm", angle, table.relative_illumination[i].tolist(), colour)
@@ -153,7 +153,7 @@ def illumination(table: LensTable) -> Figure:
 
 
 def distortion(result: LensResult) -> Figure:
-    """Distortion of the chief ray against the field angle."""
+    """Draw the distortion of the chief ray against the field angle."""
     angle = [field.angle_deg for field in result.fields]
     values = [field.distortion_percent for field in result.fields]
     name = f"{result.reference_wavelength_nm:.0f} nm"
@@ -164,7 +164,7 @@ def distortion(result: LensResult) -> Figure:
 
 
 def lateral_colour(table: LensTable) -> Figure:
-    """Centroid height of each wavelength relative to the middle wavelength, against the field angle."""
+    """Draw the centroid height of each wavelength relative to the middle wavelength, against the field angle."""
     angle = table.field_deg[:, 1].tolist()
     chosen = _spectral(table)
     middle = table.centroid_um[chosen[len(chosen) // 2][0], :, 1]
@@ -179,7 +179,7 @@ def lateral_colour(table: LensTable) -> Figure:
 
 
 def mtf_against_field(result: LensResult) -> Figure:
-    """MTF at the stated frequencies against the field angle: sagittal solid, tangential dashed."""
+    """Draw MTF at the stated frequencies against the field angle: sagittal solid, tangential dashed."""
     angle = [field.angle_deg for field in result.fields]
     reference = [
         next(curve for curve in field.mtf if curve.wavelength_nm == result.reference_wavelength_nm)
@@ -201,7 +201,7 @@ def mtf_against_field(result: LensResult) -> Figure:
 
 
 def encircled(table: LensTable) -> Figure:
-    """Share of the light within the table's window, against the field angle."""
+    """Draw the share of the light within the table's window, against the field angle."""
     angle = table.field_deg[:, 1].tolist()
     traces = [
         _curve(f"{table.wavelength_nm[i]:.0f} nm", angle, (100 * table.encircled_share[i]).tolist(), colour)

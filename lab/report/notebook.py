@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from lab.calibration.life import History
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, Skipped, ValidationResult
-from lab.formats.results.words import measured
+from lab.formats.results.words import format_value
 from lab.observables.observable import measurement_title
 from lab.pipeline import PipelineResult
 from lab.predict.simulate import Simulation, preview
@@ -94,8 +94,8 @@ def _charts(result: object) -> Callable[[], str]:
     return lambda: "".join(picture(chart) for chart in islice(charts_of(result), CHARTS))
 
 
-def _skipped(items: Sequence[Skipped]) -> tuple[str, ...]:
-    return tuple(f"{one.step}{f' ({one.side})' if one.side else ''}: {one.reason}" for one in items)
+def _list_skipped(items: Sequence[Skipped]) -> tuple[str, ...]:
+    return tuple(f"{item.step}{f' ({item.side})' if item.side else ''}: {item.reason}" for item in items)
 
 
 @singledispatch
@@ -108,16 +108,17 @@ def summary(result: object) -> ShownSummary:
 def _(result: FitResult) -> ShownSummary:
     sides = tuple(result.cameras)
     rows = [
-        (name, *(found[side].text if side in found else "–" for side in sides)) for name, found in by_side(result, {})
+        (name, *(figure_of_side[side].text if side in figure_of_side else "–" for side in sides))
+        for name, figure_of_side in by_side(result, {})
     ]
-    for one in stereo_figures(result.stereo) if result.stereo is not None else ():
-        rows.append((one.name, one.text, *[""] * (len(sides) - 1)))
+    for figure in stereo_figures(result.stereo) if result.stereo is not None else ():
+        rows.append((figure.name, figure.text, *[""] * (len(sides) - 1)))
     return ShownSummary(
         f"Fit of {result.source}",
         ("quantity", *(f"{side} (± one standard deviation)" for side in sides)),
         tuple(rows),
         tuple(f"Warning: {line}" for line in result.warnings),
-        _skipped(result.skipped),
+        _list_skipped(result.skipped),
         _charts(result),
     )
 
@@ -127,15 +128,15 @@ def _(result: ValidationResult) -> ShownSummary:
     passed = sum(check.passed for check in result.checks)
     rows = tuple(
         (
-            one.side,
-            words.CHECK_NAMES[one.name],
-            one.capture,
-            f"{one.chi2:.4g}",
-            str(one.n),
-            f"{one.rms_relative_percent:.2g} %",
-            "passed" if one.passed else "failed",
+            check.side,
+            words.CHECK_NAMES[check.name],
+            check.capture,
+            f"{check.chi2:.4g}",
+            str(check.n),
+            f"{check.rms_relative_percent:.2g} %",
+            "passed" if check.passed else "failed",
         )
-        for one in result.checks
+        for check in result.checks
     )
     return ShownSummary(
         f"Validation of {result.source}: {passed} of {len(result.checks)} checks passed "
@@ -143,7 +144,7 @@ def _(result: ValidationResult) -> ShownSummary:
         ("side", "check", "capture", "chi2", "n", "rms difference", "result"),
         rows,
         (),
-        _skipped(result.skipped),
+        _list_skipped(result.skipped),
         _charts(result),
     )
 
@@ -171,7 +172,7 @@ def _(result: DiagnosisResult) -> ShownSummary:
         ("effect", "probability", "alternatives"),
         rows,
         tuple(lines),
-        _skipped(result.skipped),
+        _list_skipped(result.skipped),
         _charts(result),
     )
 
@@ -185,23 +186,23 @@ def _(result: ComparisonResult) -> ShownSummary:
     ordered = sorted(result.changes, key=lambda row: -row.significance_sigma)
     rows = tuple(
         (
-            one.side or "",
-            f"{one.title or one.name} {one.where}".strip(),
-            measured(one.a, one.a_std, one.unit),
-            measured(one.b, one.b_std, one.unit),
-            f"{one.significance_sigma:.1f}",
-            "changed" if one.changed else "",
+            change.side or "",
+            f"{change.title or change.name} {change.where}".strip(),
+            format_value(change.a, change.a_std, change.unit),
+            format_value(change.b, change.b_std, change.unit),
+            f"{change.significance_sigma:.1f}",
+            "changed" if change.changed else "",
         )
-        for one in ordered
+        for change in ordered
     )
-    changed = sum(one.changed for one in result.changes) + sum(one.changed for one in result.projection)
+    changed = sum(change.changed for change in result.changes) + sum(change.changed for change in result.projection)
     return ShownSummary(
         f"{result.a} and {result.b}: {changed} of {len(result.changes) + len(result.projection)} figures changed "
         f"beyond {result.threshold_sigma:.1f} sigma (false-alarm rate {100 * result.false_alarm_rate:g} %)",
         ("side", "quantity", "A", "B", "difference, sigma", ""),
         rows,
         result.instruments,
-        _skipped(result.skipped),
+        _list_skipped(result.skipped),
     )
 
 
@@ -212,11 +213,11 @@ def _(result: RecordingSet) -> ShownSummary:
 
     def pictures() -> str:
         shown = [first[key] for key in list(counted)[:FRAMES]]
-        uris = [frame_picture(result.frame(one), result.camera(one.side), FRAME_PX) for one in shown]
+        uris = [frame_picture(result.frame(capture), result.camera(capture.side), FRAME_PX) for capture in shown]
         return "".join(
-            f'<figure style="display:inline-block;margin:0.4em"><figcaption>{escape(one.id)}</figcaption>'
-            f'<img alt="{escape(one.id, quote=True)}" src="{uri}"></figure>'
-            for one, uri in zip(shown, uris, strict=True)
+            f'<figure style="display:inline-block;margin:0.4em"><figcaption>{escape(capture.id)}</figcaption>'
+            f'<img alt="{escape(capture.id, quote=True)}" src="{uri}"></figure>'
+            for capture, uri in zip(shown, uris, strict=True)
         )
 
     return ShownSummary(
@@ -232,7 +233,7 @@ def _(result: RecordingSet) -> ShownSummary:
 @summary.register
 def _(result: Simulation) -> ShownSummary:
     record = result.record
-    found, rows, cols = record.summary, *result.frame.shape
+    frame_figures, rows, cols = record.summary, *result.frame.shape
 
     def pictures() -> str:
         uri = photograph_data_uri(preview(result.frame, result.camera, result.white))
@@ -243,10 +244,10 @@ def _(result: Simulation) -> ShownSummary:
         f"{record.camera['cfa']}",
         ("quantity", "value"),
         (
-            ("exposure", f"{found.exposure_s:.4g} s"),
-            ("mean", f"{found.mean_electrons:.4g} e, {found.mean_dn:.4g} DN"),
-            ("SNR at the mean", f"{found.snr:.3g}"),
-            ("saturated pixels", f"{found.saturated_percent:.2g} %"),
+            ("exposure", f"{frame_figures.exposure_s:.4g} s"),
+            ("mean", f"{frame_figures.mean_electrons:.4g} e, {frame_figures.mean_dn:.4g} DN"),
+            ("SNR at the mean", f"{frame_figures.snr:.3g}"),
+            ("saturated pixels", f"{frame_figures.saturated_percent:.2g} %"),
         ),
         tuple(f"Warning: {line}" for line in record.lens_warnings),
         pictures=pictures,
@@ -261,13 +262,13 @@ def _(result: History) -> ShownSummary:
         ("calibration", "created (UTC)", "value", "difference, sigma", ""),
         tuple(
             (
-                one.calibration_id,
-                f"{one.created:%Y-%m-%d %H:%M}",
-                measured(one.value, one.std, result.unit),
-                "" if one.significance_sigma is None else f"{one.significance_sigma:.1f}",
-                "drifted" * one.drifted,
+                point.calibration_id,
+                f"{point.created:%Y-%m-%d %H:%M}",
+                format_value(point.value, point.std, result.unit),
+                "" if point.significance_sigma is None else f"{point.significance_sigma:.1f}",
+                "drifted" * point.drifted,
             )
-            for one in result.points
+            for point in result.points
         ),
         pictures=_charts(result),
     )
@@ -275,8 +276,12 @@ def _(result: History) -> ShownSummary:
 
 @summary.register
 def _(result: SealedPrediction) -> ShownSummary:
-    counted = Counter((side, number.quantity) for side, one in result.sides.items() for number in one.numbers)
-    skipped = tuple(line for one in result.sides.values() for line in _skipped(one.skipped))
+    counted = Counter(
+        (side, number.quantity) for side, side_prediction in result.sides.items() for number in side_prediction.numbers
+    )
+    skipped = tuple(
+        line for side_prediction in result.sides.values() for line in _list_skipped(side_prediction.skipped)
+    )
     rows = tuple((side, title(quantity), str(number)) for (side, quantity), number in counted.items())
     return ShownSummary(f"Prediction of {result.plan}", ("side", "quantity", "numbers"), rows, skipped=skipped)
 
@@ -289,16 +294,16 @@ def _(result: TwinScore) -> ShownSummary:
         ("quantity", "n", "median deviation", "in 95 % intervals", "chi2 / n"),
         tuple(
             (
-                title(one.quantity),
-                str(one.n),
-                f"{one.median:.3g}{' %' if one.unit == '%' else ''}",
-                f"{100 * one.within_95_percent_interval:.1f} %",
-                f"{one.chi2 / one.n:.2f}",
+                title(quantity.quantity),
+                str(quantity.n),
+                f"{quantity.median:.3g}{' %' if quantity.unit == '%' else ''}",
+                f"{100 * quantity.within_95_percent_interval:.1f} %",
+                f"{quantity.chi2 / quantity.n:.2f}",
             )
-            for one in result.quantities
+            for quantity in result.quantities
         ),
         tuple(f"{side}: {conclusion([e for e in result.effects if e.side == side])}" for side in sides),
-        _skipped(result.skipped),
+        _list_skipped(result.skipped),
     )
 
 

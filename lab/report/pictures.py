@@ -25,14 +25,22 @@ WEBP_QUALITY = 85
 
 
 def png(image: NDArray[np.uint8]) -> bytes:
-    """Return an image (rows, cols) or (rows, cols, 3: R, G, B) as a PNG file's content."""
+    """Return an image (rows, cols) or (rows, cols, 3: R, G, B) as a PNG file's content.
+
+    >>> png(np.zeros((2, 2), np.uint8))[1:4]
+    b'PNG'
+    """
     pixels = image if image.ndim == 2 else image[..., ::-1]
     _, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
     return data.tobytes()
 
 
 def png_data_uri(image: NDArray[np.uint8]) -> str:
-    """Return the same as the text of a PNG data URI."""
+    """Return an image (rows, cols) or (rows, cols, 3: R, G, B) as the text of a PNG data URI.
+
+    >>> png_data_uri(np.zeros((2, 2), np.uint8))[:22]
+    'data:image/png;base64,'
+    """
     return "data:image/png;base64," + base64.b64encode(png(image)).decode("ascii")
 
 
@@ -55,8 +63,17 @@ def kernel_picture(kernel: ArrayLike, peak: float, margin: int = 0) -> str:
 
 
 def map_picture(values: ArrayLike, width_px: int | None = None) -> tuple[NDArray[np.uint8], float, float]:
-    """Return a map (rows, cols) in colours (rows, cols, 3: R, G, B) from its 1st percentile (dark) to its 99th
-    (bright), and these two; averaged down to `width_px` columns where it has more."""
+    """Return a map in colours from its 1st percentile (dark) to its 99th (bright), and these two.
+
+    values : (rows, cols)
+    width_px : columns to which it is averaged down where it has more
+
+    Returns the picture (rows, cols, 3: R, G, B) and both percentiles, in the unit of the map.
+
+    >>> picture, low, high = map_picture(np.linspace(0.0, 1.0, 101)[None].repeat(4, axis=0))
+    >>> picture.shape, round(low, 2), round(high, 2)
+    ((4, 101, 3), 0.01, 0.99)
+    """
     given = np.asarray(values, float)
     low, high = (float(limit) for limit in np.percentile(given, [1.0, 99.0]))
     share = np.clip((given - low) / max(high - low, 1e-12), 0.0, 1.0)
@@ -79,8 +96,13 @@ def difference_picture(difference: ArrayLike, limit: float, margin: int = 0) -> 
 
 
 def trim_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> int:
-    """Width of the border, in cells, in which all `kernels` stay below `share` of their highest value; at least 7 cells
-    are left."""
+    """Return the width of the border, in cells, in which all `kernels` stay below `share` of their highest value.
+
+    kernels : (n, n) each; at least 7 cells of them are left
+
+    >>> trim_margin([np.pad([[1.0]], 10)])
+    7
+    """
     highest = max(float(kernel.max()) for kernel in kernels)
     size = min(min(kernel.shape) for kernel in kernels)
     margin = 0
@@ -93,7 +115,8 @@ def trim_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> int:
 
 
 def patch_colours(patches: tuple[PatchComparison, ...]) -> dict[str, tuple[str, str]]:
-    """Patch -> (measured, predicted) as CSS colours: camera R, G, B balanced on the measured white patch, gamma 2.2.
+    """Return (measured, predicted) of each patch as CSS colours: camera R, G, B balanced on the measured white patch,
+    gamma 2.2.
 
     These are camera colours, not colorimetry. Both get the same balance, so that a difference on the page is one in the
     recording."""

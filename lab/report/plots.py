@@ -59,10 +59,10 @@ class Chart:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the Plotly figure as a dictionary, for `plotly.io.show` and for other programs."""
-        found: dict[str, Any] = _on_white({"data": self.figure["data"], "layout": self.figure["layout"]})
-        found["layout"] |= {"title": {"text": self.title, "font": {"size": 14}}, "paper_bgcolor": "#ffffff"}
-        found["layout"]["margin"] = found["layout"]["margin"] | {"t": 76}
-        return found
+        figure: dict[str, Any] = _on_white({"data": self.figure["data"], "layout": self.figure["layout"]})
+        figure["layout"] |= {"title": {"text": self.title, "font": {"size": 14}}, "paper_bgcolor": "#ffffff"}
+        figure["layout"]["margin"] = figure["layout"]["margin"] | {"t": 76}
+        return figure
 
     def to_plotly(self) -> plotly.graph_objects.Figure:
         """Return the chart as `plotly.graph_objects.Figure`. Needs plotly (calibench's extra `notebook`).
@@ -128,7 +128,14 @@ def _on_white(value: Any) -> Any:
 
 @singledispatch
 def charts_of(result: object) -> Iterator[Chart]:
-    """Yield the charts of a result, the one that tells most first; none of what has no chart."""
+    """Yield the charts of a result, the one that tells most first; none of what has no chart.
+
+    result : of `calibench.fit`, `validate`, `diagnose`, `compare`, `predict`, `score` or `certify`
+
+    >>> import calibench
+    >>> list(calibench.charts_of(calibench.FitResult(source="my-camera", cameras={})))
+    []
+    """
     yield from ()
 
 
@@ -154,7 +161,7 @@ def _(result: FitResult) -> Iterator[Chart]:
 
 @charts_of.register
 def _(result: ValidationResult) -> Iterator[Chart]:
-    for check in sorted(result.checks, key=lambda one: -one.chi2 / max(one.n, 1)):
+    for check in sorted(result.checks, key=lambda check: -check.chi2 / max(check.n, 1)):
         name = f"{check.side} {check.name} {check.capture}"
         title = f"{check.side}: {check.name} of {check.capture}, measured and predicted"
         if check.curves:
@@ -166,7 +173,9 @@ def _(result: ValidationResult) -> Iterator[Chart]:
 @charts_of.register
 def _(result: DiagnosisResult) -> Iterator[Chart]:
     proofs = proof_curves(result)
-    others = [one for one in worst_of_each([c for c in result.curves if len(c.x) > 3], CURVES) if one not in proofs]
+    others = [
+        curve for curve in worst_of_each([c for c in result.curves if len(c.x) > 3], CURVES) if curve not in proofs
+    ]
     for curve in (*proofs, *others):
         title, caption = proof_words(curve)
         yield Chart(f"{curve.side} {curve.measurement}", f"{title}. {caption}", charts.residual_curve(curve))
@@ -211,8 +220,8 @@ def _(result: Emva1288Points) -> Iterator[Chart]:
 @charts_of.register
 def _(result: History) -> Iterator[Chart]:
     points: Trace = {"type": "scatter", "mode": "lines+markers", "name": result.camera}
-    points |= {"x": [float(k + 1) for k in range(len(result.points))], "y": [one.value for one in result.points]}
-    points |= {"error_y": charts.error_bars([one.std for one in result.points], charts.AFTER)}
+    points |= {"x": [float(k + 1) for k in range(len(result.points))], "y": [point.value for point in result.points]}
+    points |= {"error_y": charts.error_bars([point.std for point in result.points], charts.AFTER)}
     points |= {"marker": {"color": charts.AFTER, "size": 6}, "line": {"color": charts.AFTER, "width": 1}}
     title = result.title or result.figure
     axes = {

@@ -22,7 +22,7 @@ from lab.formats.results.standards import (
     StandardReading,
     StandardsResult,
 )
-from lab.formats.results.words import measured, shown_unit
+from lab.formats.results.words import format_unit, format_value
 from lab.report import page_environment, write_page
 from lab.report.charts import (
     AFTER,
@@ -68,7 +68,7 @@ class StandardRow:
     @property
     def unit(self) -> str:
         """The unit as it is shown; empty of a ratio."""
-        return shown_unit(self.figure.unit)
+        return format_unit(self.figure.unit)
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,11 @@ class StandardSection:
 
 
 def file_name(standard: str) -> str:
-    """Return the name of a standard's page, without its ending."""
+    """Return the name of a standard's page, without its ending.
+
+    >>> file_name("ISO 12233:2023")
+    'iso-12233-2023'
+    """
     return re.sub(r"[^a-z0-9]+", "-", standard.lower()).strip("-")
 
 
@@ -128,7 +132,7 @@ def plot_figure(plot: StandardPlot) -> Figure:
 
 
 def _trace(curve: PlotCurve, colour: str) -> Trace:
-    found: Trace = {
+    trace: Trace = {
         "type": "scatter",
         "name": curve.label,
         "x": list(curve.x),
@@ -138,21 +142,21 @@ def _trace(curve: PlotCurve, colour: str) -> Trace:
         "line": {"color": colour, "width": 1.6, "dash": "dash" if curve.style == "dashed" else "solid"},
     }
     if curve.style == "points" and curve.y_std:
-        found["error_y"] = error_bars(curve.y_std, colour)
-    return found
+        trace["error_y"] = error_bars(curve.y_std, colour)
+    return trace
 
 
-def map_figure(one: StandardMap) -> Figure:
+def map_figure(plane: StandardMap) -> Figure:
     """Return a map as a Plotly figure, rows from the top."""
     return {
         "data": [
             {
                 "type": "heatmap",
-                "z": [list(row) for row in one.values],
+                "z": [list(row) for row in plane.values],
                 "colorscale": "Viridis",
-                "colorbar": {"title": {"text": one.unit}, "thickness": 12},
+                "colorbar": {"title": {"text": plane.unit}, "thickness": 12},
                 "hoverongaps": False,
-                "name": one.title,
+                "name": plane.title,
             }
         ],
         "layout": layout(
@@ -166,25 +170,25 @@ def map_figure(one: StandardMap) -> Figure:
 def _value(figure: StandardFigure) -> str:
     if figure.estimate is None:
         return "–"
-    return measured(figure.estimate.value, figure.estimate.std)
+    return format_value(figure.estimate.value, figure.estimate.std)
 
 
 def _tables(readings: Sequence[StandardReading]) -> Iterator[FigureTable]:
     """Yield tables of readings with the same figures, at most `MOST_COLUMNS` beside each other."""
     groups: dict[tuple[str, ...], list[StandardReading]] = {}
     for reading in readings:
-        groups.setdefault(tuple(one.name for one in reading.figures), []).append(reading)
+        groups.setdefault(tuple(figure.name for figure in reading.figures), []).append(reading)
     for alike in groups.values():
         for begin in range(0, len(alike), MOST_COLUMNS):
             part = alike[begin : begin + MOST_COLUMNS]
             rows = []
             for each in zip(*(reading.figures for reading in part), strict=True):
-                reasons = dict.fromkeys(one.reason for one in each if one.reason)
+                reasons = dict.fromkeys(figure.reason for figure in each if figure.reason)
                 rows.append(
                     StandardRow(
                         figure=each[0],
-                        values=tuple(_value(one) for one in each),
-                        marks=tuple(one.by_the_standard for one in each),
+                        values=tuple(_value(figure) for figure in each),
+                        marks=tuple(figure.by_the_standard for figure in each),
                         reason="; ".join(reasons),
                     )
                 )
@@ -193,20 +197,20 @@ def _tables(readings: Sequence[StandardReading]) -> Iterator[FigureTable]:
 
 def _lines(readings: Sequence[StandardReading], kind: str) -> tuple[str, ...]:
     """Return the deviations or remarks of readings, each once, with the subjects that it concerns where not all."""
-    found: dict[str, list[StandardReading]] = {}
+    readings_of_line: dict[str, list[StandardReading]] = {}
     for reading in readings:
-        for one in getattr(reading, kind):
-            found.setdefault(one.line if isinstance(one, Deviation) else one, []).append(reading)
+        for remark in getattr(reading, kind):
+            readings_of_line.setdefault(remark.line if isinstance(remark, Deviation) else remark, []).append(reading)
 
     def names(reading: StandardReading) -> tuple[str, ...]:
-        return tuple(one.name for one in reading.figures)
+        return tuple(figure.name for figure in reading.figures)
 
     lines = []
-    for line, of in found.items():
+    for line, of in readings_of_line.items():
         # whether a standard that reads one subject as a whole, too, has it there or not makes no difference
-        kinds = {names(one) for one in of}
-        every = all(one in of for one in readings if names(one) in kinds)
-        subjects = dict.fromkeys(one.subject for one in of)
+        kinds = {names(reading) for reading in of}
+        every = all(reading in of for reading in readings if names(reading) in kinds)
+        subjects = dict.fromkeys(reading.subject for reading in of)
         lines.append(line if every else f"{', '.join(subjects)}: {line}")
     return tuple(lines)
 
@@ -216,8 +220,8 @@ def _pictures(
 ) -> Iterator[StandardsPicture]:
     for number, reading in enumerate(readings):
         of = f", {reading.subject}" if len(readings) > 1 else ""
-        for one in reading.maps:
-            yield StandardsPicture(f"{one.title}{of}", map_figure(one), one.caption)
+        for plane in reading.maps:
+            yield StandardsPicture(f"{plane.title}{of}", map_figure(plane), plane.caption)
         if number < MOST_PLOTTED:
             for plot in reading.plots:
                 yield StandardsPicture(f"{plot.title}{of}", plot_figure(plot), plot.caption)
@@ -232,8 +236,8 @@ def _data_sheet(reading: StandardReading, recordings: RecordingSet, fit: FitResu
     if noise is None:
         return
     plane = next(name for name in ("Y", "G1", *noise.emva1288) if name in noise.emva1288)
-    own = noise.emva1288[plane]
-    for plot in (*temporal_plots(own, plane), *spatial_plots(recordings, reading.side, own, plane)):
+    figures = noise.emva1288[plane]
+    for plot in (*temporal_plots(figures, plane), *spatial_plots(recordings, reading.side, figures, plane)):
         yield StandardsPicture(f"{plot.title}, plane {plane}", plot.figure, plot.caption)
 
 
@@ -248,25 +252,25 @@ def sections(
     return [
         StandardSection(
             standard=standard,
-            title=own[-1].title,
+            title=readings[-1].title,
             side=side,
-            conditions=tuple(dict.fromkeys(line for reading in own for line in reading.conditions))
-            if len(own) <= MOST_COLUMNS
-            else own[0].conditions,
-            tables=tuple(_tables(own)),
-            deviations=_lines(own, "deviations"),
-            remarks=_lines(own, "remarks"),
-            pictures=tuple(_pictures(own, recordings, fit)),
+            conditions=tuple(dict.fromkeys(line for reading in readings for line in reading.conditions))
+            if len(readings) <= MOST_COLUMNS
+            else readings[0].conditions,
+            tables=tuple(_tables(readings)),
+            deviations=_lines(readings, "deviations"),
+            remarks=_lines(readings, "remarks"),
+            pictures=tuple(_pictures(readings, recordings, fit)),
         )
-        for (standard, side), own in groups.items()
+        for (standard, side), readings in groups.items()
     ]
 
 
 def write_standards(
-    folder: Path, result: StandardsResult, recordings: RecordingSet, found: Sequence[StandardSection]
+    folder: Path, result: StandardsResult, recordings: RecordingSet, standard_sections: Sequence[StandardSection]
 ) -> Path:
     """Write `folder`/standards.html, the overview, and one page for each standard; return the overview's path.
-    `found`: what `sections` returns. Raises InputError where one can't be written."""
+    `standard_sections`: what `sections` returns. Raises InputError where one can't be written."""
     environment = page_environment()
     shared: dict[str, Any] = {
         "version": metadata.version("calibench"),
@@ -274,14 +278,14 @@ def write_standards(
         "name": recordings.manifest.name or result.source,
         "plotly": "",
     }
-    names = dict.fromkeys(one.standard for one in found)
+    names = dict.fromkeys(section.standard for section in standard_sections)
     for name in names:
-        own = [one for one in found if one.standard == name]
+        own_sections = [section for section in standard_sections if section.standard == name]
         page = environment.get_template("standard.html").render(
             shared
             | {
                 "standard": name,
-                "sections": own,
+                "sections": own_sections,
                 "chart_data": ChartData(),
                 "plotly": plotly_base64(),
                 "not_by": NOT_BY,
@@ -291,7 +295,7 @@ def write_standards(
     overview = environment.get_template("standards.html").render(
         shared
         | {
-            "sections": [(one, f"{file_name(one.standard)}.html") for one in found],
+            "sections": [(section, f"{file_name(section.standard)}.html") for section in standard_sections],
             "skipped": result.skipped,
             "chart_data": ChartData(),
         }

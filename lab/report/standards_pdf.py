@@ -41,8 +41,8 @@ MARKUP = {"<sub>": "$_{", "</sub>": "}$", "<sup>": "$^{", "</sup>": "}$", "<br>"
 
 
 def _plain(text: str) -> str:
-    for plotly, own in MARKUP.items():
-        text = text.replace(plotly, own)
+    for plotly, mathtext in MARKUP.items():
+        text = text.replace(plotly, mathtext)
     return text
 
 
@@ -62,13 +62,13 @@ def draw_figure(axes: Sequence[Axes], figure: Figure) -> None:
         _draw_trace(axes[1 if second else 0], trace)
     for number, ax in enumerate(axes):
         of_x, of_y = (made.get(f"{key}axis2" if number else f"{key}axis", made[f"{key}axis"]) for key in "xy")
-        for key, own in (("x", of_x), ("y", of_y)):
-            getattr(ax, f"set_{key}label")(_plain(own.get("title", {}).get("text", "")), fontsize=SMALL_PT)
-            if own.get("type") == "log":
+        for key, settings in (("x", of_x), ("y", of_y)):
+            getattr(ax, f"set_{key}label")(_plain(settings.get("title", {}).get("text", "")), fontsize=SMALL_PT)
+            if settings.get("type") == "log":
                 getattr(ax, f"set_{key}scale")("log")
-            if "range" in own:
-                low, high = own["range"]
-                ends = (10.0**low, 10.0**high) if own.get("type") == "log" else (low, high)
+            if "range" in settings:
+                low, high = settings["range"]
+                ends = (10.0**low, 10.0**high) if settings.get("type") == "log" else (low, high)
                 getattr(ax, f"set_{key}lim")(*ends)
         ax.tick_params(labelsize=SMALL_PT - 0.8, length=2.5, which="both")
         if not ax.images:
@@ -195,8 +195,8 @@ def check_pdf() -> None:
         raise InputError("--pdf: matplotlib isn't installed; pip install 'calibench[pdf]'")
 
 
-def write_standards_pdf(file: Path, result: StandardsResult, found: Sequence[StandardSection], name: str) -> Path:
-    """Write all standards as the PDF `file`: completely, or not at all. `found`: what the pages hold; `name`: of the
+def write_standards_pdf(file: Path, result: StandardsResult, sections: Sequence[StandardSection], name: str) -> Path:
+    """Write all standards as the PDF `file`: completely, or not at all. `sections`: what the pages hold; `name`: of the
     recordings. Raises InputError where matplotlib isn't installed or the file can't be written."""
     check_pdf()
     import matplotlib as mpl
@@ -212,8 +212,8 @@ def write_standards_pdf(file: Path, result: StandardsResult, found: Sequence[Sta
             PdfPages(partial, metadata={"Title": f"Standards: {name}", "CreationDate": made}) as pages,
         ):
             sheet = _Sheet(pages, running)
-            _overview(sheet, result, found, name)
-            for section in found:
+            _overview(sheet, result, sections, name)
+            for section in sections:
                 _section(sheet, section)
             sheet.end()
     except OSError as error:
@@ -221,7 +221,7 @@ def write_standards_pdf(file: Path, result: StandardsResult, found: Sequence[Sta
     return file
 
 
-def _overview(sheet: _Sheet, result: StandardsResult, found: Sequence[StandardSection], name: str) -> None:
+def _overview(sheet: _Sheet, result: StandardsResult, sections: Sequence[StandardSection], name: str) -> None:
     sheet.begin()
     sheet.text("Camera by the standards", TITLE_PT, weight="bold")
     sheet.gap()
@@ -232,12 +232,12 @@ def _overview(sheet: _Sheet, result: StandardsResult, found: Sequence[StandardSe
         [(LEFT, "standard", muted), (0.33, "what", muted), (-0.70, "figures", muted), (-0.78, "by it", muted),
          (-RIGHT, "requirements not met", muted)]
     )  # fmt: skip
-    for one in found:
-        label = f"{one.standard} ({one.side})"
+    for section in sections:
+        label = f"{section.standard} ({section.side})"
         sheet.row(
-            [(LEFT, label, fg), (0.33, textwrap.shorten(one.title, 46, placeholder="…"), fg),
-             (-0.70, f"{one.figures}", fg), (-0.78, f"{one.by_the_standard}", fg),
-             (-RIGHT, f"{len(one.deviations)}", fg)]
+            [(LEFT, label, fg), (0.33, textwrap.shorten(section.title, 46, placeholder="…"), fg),
+             (-0.70, f"{section.figures}", fg), (-0.78, f"{section.by_the_standard}", fg),
+             (-RIGHT, f"{len(section.deviations)}", fg)]
         )  # fmt: skip
     if result.skipped:
         sheet.gap(1.5)

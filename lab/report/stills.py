@@ -42,7 +42,7 @@ class _Scale:
         """Round values in the range, `most` intervals at most."""
         raw = (self.high - self.low) / most
         power = 10.0 ** math.floor(math.log10(raw))
-        step = next(power * one for one in STEPS if power * one >= raw * (1 - 1e-9))
+        step = next(power * factor for factor in STEPS if power * factor >= raw * (1 - 1e-9))
         first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
         return [n * step for n in range(first, last + 1)]
 
@@ -188,7 +188,7 @@ def still(figure: Figure, number: int) -> Markup:
         low, high = axis.get("domain", (0.0, 1.0))
         mine = [trace for trace in data if trace.get("yaxis", "y") == id]
         shapes = [shape for shape in layout.get("shapes", ()) if shape["yref"] == id]
-        values = [end for one in mine for _, y, half in _pairs(one, "error_y") for end in (y - half, y + half)]
+        values = [end for trace in mine for _, y, half in _pairs(trace, "error_y") for end in (y - half, y + half)]
         values += [shape[end] for shape in shapes for end in ("y0", "y1")]
         y_of = _Scale(*_range(axis, values), bottom - low * (bottom - top), bottom - high * (bottom - top))
         for shape in shapes:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lab.formats.results import Check, DiagnosisResult, ParameterValue
-from lab.formats.results.words import measured, plain_number
+from lab.formats.results.words import format_value, plain_number
 from sim.camera import Side
 
 #: Verdict -> (what stands on the badge, its mood, the headline).
@@ -42,7 +42,7 @@ def parameter_name(name: str, value: ParameterValue) -> str:
 
 def parameter_value(value: ParameterValue) -> str:
     """Return a parameter's value with its uncertainty; and that its size isn't determined, where it isn't."""
-    text = measured(value.value, value.std, value.unit, value.shown_interval)
+    text = format_value(value.value, value.std, value.unit, value.shown_interval)
     return text if value.is_determined else f"{text}, not determined"
 
 
@@ -81,7 +81,9 @@ def models(has_both: bool, has_improved: bool) -> str:
     )
 
 
-def compared(baseline: Sequence[Check], improved: Sequence[Check], fitted: Sequence[Check]) -> list[ComparedCheck]:
+def compare_checks(
+    baseline: Sequence[Check], improved: Sequence[Check], fitted: Sequence[Check]
+) -> list[ComparedCheck]:
     """Return the checks by kind and side, with the results of each model that predicted them."""
     given = {"baseline": baseline, "improved model": improved, FITTED: fitted}
     grouped: dict[tuple[str, Side], dict[str, list[Check]]] = {}
@@ -92,14 +94,14 @@ def compared(baseline: Sequence[Check], improved: Sequence[Check], fitted: Seque
         ComparedCheck(
             name=CHECK_NAMES[name],
             side=side,
-            captures=max(len(checks) for checks in found.values()),
-            results={model: _told(checks) for model, checks in found.items()},
+            captures=max(len(checks) for checks in checks_of_model.values()),
+            results={model: _summarise_checks(checks) for model, checks in checks_of_model.items()},
         )
-        for (name, side), found in sorted(grouped.items(), key=lambda item: (item[0][1], item[0][0]))
+        for (name, side), checks_of_model in sorted(grouped.items(), key=lambda item: (item[0][1], item[0][0]))
     ]
 
 
-def _told(checks: Sequence[Check]) -> tuple[str, bool]:
+def _summarise_checks(checks: Sequence[Check]) -> tuple[str, bool]:
     """Return the largest deviation and chi2 per number of checks, and whether all pass."""
     rms = max(check.rms_relative_percent for check in checks)
     per_number = max(check.chi2 / max(check.n, 1) for check in checks)

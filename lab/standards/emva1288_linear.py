@@ -14,7 +14,7 @@ from lab.errors import NotDetermined
 from lab.formats.results import Emva1288
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation
-from lab.formats.results.words import measured
+from lab.formats.results.words import format_value
 from lab.standards.standard import ClauseFigure, MeasuredSide, NotDone, Standard
 
 LEAST_LEVELS = 50
@@ -326,7 +326,7 @@ class Emva1288Linear(Standard):
             / joint
         )
         yield (
-            f"the standard's straight line gives a K that differs by {measured(share, std, '%')} from the slope at "
+            f"the standard's straight line gives a K that differs by {format_value(share, std, '%')} from the slope at "
             "zero signal of the measured photon-transfer curve, which nonlinearity and the brighter-fatter effect bend"
         )
 
@@ -402,7 +402,7 @@ def uniformity_deviations(figures: Emva1288) -> Iterator[Deviation]:
         yield Deviation(
             clause="6.1",
             quantity="nonuniformity of the light (ΔE, highest less lowest over the mean)",
-            found=measured(span, std, "%"),
+            found=format_value(span, std, "%"),
             limit=f"{LARGEST_NONUNIFORMITY_PERCENT:g} % at most",
             remedy="light the bare sensor evenly, without a lens, at 8 times the diameter of the light's disc",
         )

@@ -26,7 +26,7 @@ from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import NotDetermined
 from lab.formats.results.estimate import Estimate
 from lab.formats.results.standards import Deviation, PlotCurve, StandardMap, StandardPlot
-from lab.formats.results.words import measured
+from lab.formats.results.words import format_value
 from lab.observables.edges.finding import Region, region_planes
 from lab.observables.edges.measured import edges_of, measure_edge
 from lab.observables.edges.mtf import EdgeMtf, read_mtf
@@ -415,7 +415,7 @@ class Iso12233(Standard):
         pitch = self.edge.pitch_px
         yield (
             "by the third edition (Hamming window, straight line) SFR50 is "
-            f"{measured(value / pitch, std / pitch)} cy/px"
+            f"{format_value(value / pitch, std / pitch)} cy/px"
         )
 
     def plots(self) -> Iterator[StandardPlot]:

@@ -13,7 +13,7 @@ import numpy as np
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
 from lab.formats.results.standards import Deviation
-from lab.formats.results.words import measured
+from lab.formats.results.words import format_value
 from lab.observables.flats.stated_light import light_of
 from lab.observables.noise.levels import MeasuredLevel
 from lab.observables.noise.stack import PlaneStatistics
@@ -62,7 +62,7 @@ class ToneSteps:
             yield Deviation(
                 clause=clause,
                 quantity="nonuniformity of the light (highest less lowest over the mean)",
-                found=measured(self.span_percent, self.span_percent_std, "%"),
+                found=format_value(self.span_percent, self.span_percent_std, "%"),
                 limit=f"{LARGEST_SPAN_PERCENT:g} % at most",
                 remedy="light the sensor evenly, or read a smaller part of the frame",
             )

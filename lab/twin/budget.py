@@ -91,24 +91,24 @@ def _exposure_s(camera: CameraModel) -> float:
 
 def _mtf50(camera: CameraModel, effects: Effects, exposure_s: float) -> FloatArray:
     """MTF50, cy/px, along rows and columns by channel."""
-    found = []
+    mtf50 = []
     for channel in camera.channels:
         for fx, fy in ((FREQUENCY, 0.0 * FREQUENCY), (0.0 * FREQUENCY, FREQUENCY)):
             mtf = np.abs(optical_transfer(camera, channel, LIGHT, fx, fy, effects))
             below = int(np.argmax(mtf < 0.5)) or len(FREQUENCY) - 1
-            found.append(np.interp(-0.5, -mtf[below - 1 : below + 1], FREQUENCY[below - 1 : below + 1]))
-    return np.array(found)
+            mtf50.append(np.interp(-0.5, -mtf[below - 1 : below + 1], FREQUENCY[below - 1 : below + 1]))
+    return np.array(mtf50)
 
 
 def _patches(camera: CameraModel, effects: Effects, exposure_s: float) -> FloatArray:
     """Levels above black, DN, of the chart's patches by channel."""
     model = Uniform(camera, effects)
     field = model.field(FieldPoints.of(camera))
-    found: list[float] = []
+    levels_dn: list[float] = []
     for patch in reflectances("ColorChecker24").values():
         rates = {c: electron_rate(camera, c, LIGHT, effects, "chart", reflectance=patch) for c in camera.channels}
-        found += [float(v) for v in model.mean_dn(model.electrons(rates, exposure_s, field=field)).values()]
-    return np.array(found)
+        levels_dn += [float(v) for v in model.mean_dn(model.electrons(rates, exposure_s, field=field)).values()]
+    return np.array(levels_dn)
 
 
 def _variance(camera: CameraModel, effects: Effects, exposure_s: float) -> FloatArray:
@@ -136,15 +136,23 @@ USES: dict[str, Callable[[CameraModel, Effects, float], FloatArray]] = {
 
 
 def parse_uses(text: str) -> tuple[str, ...]:
-    """Return the uses of "MTF50, patches". Raises InputError for one that isn't known."""
+    """Return the uses that a list names, each once.
+
+    text : names with commas between, in any case
+
+    Raises InputError for one that isn't known.
+
+    >>> parse_uses("mtf50")
+    ('MTF50',)
+    """
     names = {name.lower(): name for name in USES}
-    found = [one.strip() for one in text.split(",") if one.strip()]
-    unknown = [one for one in found if one.lower() not in names]
-    if unknown or not found:
+    uses = [part.strip() for part in text.split(",") if part.strip()]
+    unknown = [part for part in uses if part.lower() not in names]
+    if unknown or not uses:
         raise InputError(
             f"--use {text!r}: {unknown[0] if unknown else 'nothing'} isn't a use; take some of {', '.join(USES)}"
         )
-    return tuple(dict.fromkeys(names[one.lower()] for one in found))
+    return tuple(dict.fromkeys(names[part.lower()] for part in uses))
 
 
 @one_blas_thread
@@ -157,9 +165,11 @@ def budget(
     content = replace(content, effects=with_unnamed(content.effects, posterior))
     covariance = np.array(posterior.covariance)
     after = []
-    for one in lab_captures(content, posterior.first, station, times or StepTimes({})) if station is not None else ():
-        jacobian = _slopes(content, posterior, one.numbers(content), one.numbers).T
-        after.append((one, one.known_after(covariance, jacobian)))
+    for capture in (
+        lab_captures(content, posterior.first, station, times or StepTimes({})) if station is not None else ()
+    ):
+        jacobian = _slopes(content, posterior, capture.numbers(content), capture.numbers).T
+        after.append((capture, capture.update_covariance(covariance, jacobian)))
     return BudgetResult(model=content.name, uses=tuple(_use(content, posterior, use, after) for use in uses))
 
 
@@ -206,13 +216,13 @@ class LinearUse:
 
     def groups(self) -> dict[str, list[int]]:
         """Return the indices of the parameters that the use knows, by effect or part of the camera."""
-        found: dict[str, list[int]] = {}
+        indices: dict[str, list[int]] = {}
         for i, name in enumerate(self.names):
             if self.gradient[i].any():
-                found.setdefault(_group(name), []).append(i)
-        return found
+                indices.setdefault(_group(name), []).append(i)
+        return indices
 
-    def told_by(self, members: list[int]) -> FloatArray:
+    def propagate_errors(self, members: list[int]) -> FloatArray:
         """Return c (q, m): errors z (q,) of these parameters are relative errors z c of the use, with all that goes
         along with them."""
         inside = np.linalg.pinv(self.covariance[np.ix_(members, members)], hermitian=True)
@@ -238,30 +248,31 @@ def _use(
     linear = linear_use(content, posterior, use)
     covariance = linear.covariance
     gradient, std = linear.gradient, linear.std
-    found = []
+    contributions = []
     for name, members in linear.groups().items():
         inside = covariance[np.ix_(members, members)]
-        added = _relative_std(linear.told_by(members), inside) ** 2
-        found.append(
+        added = _relative_std(linear.propagate_errors(members), inside) ** 2
+        contributions.append(
             Contribution(
                 name=name, parameters=tuple(posterior.names[i] for i in members),
                 share_percent=100.0 * added / std**2 if std > 0 else 0.0,
                 std_percent=100.0 * _relative_std(gradient[members], inside),
             )
         )  # fmt: skip
-    found.sort(key=lambda one: -one.share_percent)
+    contributions.sort(key=lambda contribution: -contribution.share_percent)
     gains = []
-    for one, known in after:
+    for capture, known in after:
         then = _relative_std(gradient, known)
         gains.append(
             CaptureGain(
-                sequence=one.words, minutes=one.minutes, is_learned=one.is_learned, std_percent=100.0 * then,
+                sequence=capture.words, minutes=capture.minutes, is_learned=capture.is_learned,
+                std_percent=100.0 * then,
                 reduced_percent=100.0 * (std - then),
-                reduced_percent_per_minute=100.0 * (std - then) / max(one.minutes, 1e-3),
+                reduced_percent_per_minute=100.0 * (std - then) / max(capture.minutes, 1e-3),
             )
         )  # fmt: skip
-    gains.sort(key=lambda one: -one.reduced_percent_per_minute)
-    return UseBudget(use=use, std_percent=100.0 * std, contributions=tuple(found), captures=tuple(gains))
+    gains.sort(key=lambda gain: -gain.reduced_percent_per_minute)
+    return UseBudget(use=use, std_percent=100.0 * std, contributions=tuple(contributions), captures=tuple(gains))
 
 
 def _group(name: str) -> str:

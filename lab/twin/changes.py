@@ -60,34 +60,55 @@ class Changes(Frozen):
 
 
 def parse_changes(text: str) -> Changes:
-    """Return the changes of `key=value,key=value`. Raises InputError for an unknown key and a value that can't be
-    used."""
+    """Return the changes of `key=value,key=value`. Raises InputError for an unknown key and a value that can't be used.
+
+    >>> parse_changes("temperature_c=35, exposure_factor=2").temperature_c
+    35.0
+    """
     values: dict[str, str] = {}
     known = ", ".join(Changes.model_fields)
-    for part in filter(None, (one.strip() for one in text.split(","))):
-        key, equals, value = (one.strip() for one in part.partition("="))
+    for part in filter(None, (entry.strip() for entry in text.split(","))):
+        key, equals, value = (piece.strip() for piece in part.partition("="))
         if key not in Changes.model_fields:
             raise InputError(f"--change {part}: {key!r} isn't a change; take some of {known}")
         if not equals or not value or key in values:
             raise InputError(f"--change {part}: give {key}=VALUE, once")
         values[key] = value
-    return checked_changes(values, "--change ")
+    return validate_changes(values, "--change ")
 
 
-def checked_changes(values: Mapping[str, Any], where: str) -> Changes:
-    """Return the changes of these values. Raises InputError, beginning with `where`, for one that can't be used."""
+def validate_changes(values: Mapping[str, Any], where: str) -> Changes:
+    """Return changes of the camera or of the light, checked.
+
+    values : by key, as a request or a command line states them
+    where : beginning of the message
+
+    Raises InputError for one that can't be used.
+
+    >>> validate_changes({"temperature_c": 35.0}, "--change ").temperature_c
+    35.0
+    """
     try:
         return Changes.model_validate(values)
     except ValidationError as error:
-        first = next((one for one in error.errors() if one["type"] == "value_error"), error.errors()[0])
-        told = first["msg"].removeprefix("Value error, ")
+        first = next((detail for detail in error.errors() if detail["type"] == "value_error"), error.errors()[0])
+        reason = first["msg"].removeprefix("Value error, ")
         given = first["input"] if isinstance(first["input"], str | int | float) else "..."
-        raise InputError(f"{where}{first['loc'][0]}={given}: {told}; correct it") from error
+        raise InputError(f"{where}{first['loc'][0]}={given}: {reason}; correct it") from error
 
 
-def carried(content: CameraFile, changes: Changes) -> CameraFile:
-    """Return the model with the changes to its lens; aberrations say at which f-number they were fitted. Raises
-    InputError where it can't carry one of the changes."""
+def apply_changes(content: CameraFile, changes: Changes) -> CameraFile:
+    """Return the model with the changes to its lens; aberrations state at which f-number they were fitted.
+
+    content : the camera
+    changes : of lens, aperture, temperature, distance and light
+
+    Raises InputError where the model can't carry one of the changes.
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> apply_changes(default_camera(), Changes(f_number=8.0)).camera.lens.f_number
+    8.0
+    """
     fitted_f_number = content.camera.lens.f_number
     if changes.lens is not None:
         if not changes.lens.is_file():
@@ -136,7 +157,12 @@ def carried(content: CameraFile, changes: Changes) -> CameraFile:
 
 
 def reference_temperature_c(content: CameraFile) -> float | None:
-    """Temperature of the sensor, C, that the model's dark current holds for; None where nobody says."""
+    """Return the temperature of the sensor, C, that the model's dark current holds for; None where nobody states it.
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> reference_temperature_c(default_camera())
+    25.0
+    """
     if content.posterior is not None:
         return content.posterior.first.dark_temperature_c
     return content.camera.dark_current_reference_c
@@ -149,12 +175,17 @@ def has_dark_law(content: CameraFile) -> bool:
 
 
 def doubling_std_c(content: CameraFile) -> float:
-    """Standard deviation of the camera's own doubling temperature, C."""
+    """Return the standard deviation of the camera's own doubling temperature, C."""
     return content.camera.std.get("dark_current_doubling_c", DOUBLING_C_STD)
 
 
 def light_factor(content: CameraFile, changes: Changes) -> float:
-    """Factor on the light of all lit captures: dimmer lamps, and a nearer scene, whose image is larger."""
+    """Return the factor on the light of all lit captures: dimmer lamps, and a nearer scene, whose image is larger.
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> light_factor(default_camera(), Changes(radiance_factor=0.5))
+    0.5
+    """
     factor = changes.radiance_factor or 1.0
     if changes.distance_mm is None:
         return factor

@@ -55,7 +55,7 @@ class LabCapture:
     numbers: Callable[[CameraFile], FloatArray]
     covariance: FloatArray
 
-    def known_after(self, covariance: FloatArray, jacobian: FloatArray) -> FloatArray:
+    def update_covariance(self, covariance: FloatArray, jacobian: FloatArray) -> FloatArray:
         """Return the covariance (k, k) of the parameters after the capture, for the Jacobian (n, k) of its numbers."""
         known = jacobian @ covariance
         total = cho_factor(known @ jacobian.T + self.covariance, lower=True)
@@ -65,7 +65,7 @@ class LabCapture:
 def lab_captures(
     content: CameraFile, first: FirstEstimates, station: Station, times: StepTimes
 ) -> Iterator[LabCapture]:
-    """Every sequence of the station whose numbers the model predicts, as a full and as a quick session takes it."""
+    """Yield every sequence of the station whose numbers the model predicts, as a full and as a quick session has it."""
     seen: set[str] = set()
     for is_quick in (False, True):
         for sequence in full_plan(station, is_quick).sequences:
@@ -74,15 +74,15 @@ def lab_captures(
             if make is None or key in seen:
                 continue
             seen.add(key)
-            found = make(content, first, sequence, station)
+            made = make(content, first, sequence, station)
             planned = estimate(CapturePlan((sequence,)), station, times)
             yield LabCapture(
                 words=f"{sequence.name}, {planned.captures} captures" + (" (quick)" if is_quick else ""),
                 minutes=planned.estimated_s / 60.0,
-                is_learned=all(one.learned for one in planned.sequences),
+                is_learned=all(sequence_time.learned for sequence_time in planned.sequences),
                 captures=planned.captures,
-                numbers=found[0],
-                covariance=found[1],
+                numbers=made[0],
+                covariance=made[1],
             )
 
 
@@ -163,7 +163,7 @@ def _chart(content: CameraFile, first: FirstEstimates, sequence: ChartSequence, 
 
     signal = numbers(content)
     names = np.array([name for _ in camera.channels for name in known])
-    channel = np.array([one for one in camera.channels for _ in known])
+    channel = np.array([c for c in camera.channels for _ in known])
     pixels = camera.rows * camera.cols / len(camera.channels) / (2.0 * len(known)) * sequence.frames
     noise = (camera.conversion_gain_dn_per_e * signal + first.read_noise_dn**2) / pixels
     light = CHART_SCALE_STD**2 * np.outer(signal, signal)
@@ -177,8 +177,8 @@ def _edges(content: CameraFile, first: FirstEstimates, sequence: EdgeSequence, s
 
     def numbers(changed: CameraFile) -> FloatArray:
         camera = changed.camera
-        found = [np.real(optical_transfer(camera, c, LIGHT, fx, fy, changed.effects)) for c in camera.channels]
-        return np.array(found).ravel()
+        contrasts = [np.real(optical_transfer(camera, c, LIGHT, fx, fy, changed.effects)) for c in camera.channels]
+        return np.array(contrasts).ravel()
 
     return numbers, np.eye(fx.size * len(content.camera.channels)) * EDGE_STD**2 / sequence.frames
 

@@ -36,7 +36,7 @@ from lab.observables.noise.figures import BLACK_FLOOR_DN, USUAL_JITTER_DN, Noise
 from lab.observables.noise.repeatability import USUAL_LAMP
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.one_blas_thread import one_blas_thread
-from lab.twin.changes import Changes, carried, doubling_std_c, reference_temperature_c
+from lab.twin.changes import Changes, apply_changes, doubling_std_c, reference_temperature_c
 from lab.twin.relative_light import RelativeLight, rates_per_dose, relative_light
 from lab.twin.sealed import PredictedName, PredictedNumber, PredictedRival, SealedPrediction, SidePrediction
 from lab.twin.session import check_sensor, future_session
@@ -86,13 +86,13 @@ def predict(
     if not sides:
         raise InputError(f"{plan.source}: no camera that the model has; give the plan of the same cameras")
     changes.spectrum()
-    checked = {side: (carried(models[side], changes), posterior_of(models[side])) for side in sides}
-    found = {}
+    checked = {side: (apply_changes(models[side], changes), posterior_of(models[side])) for side in sides}
+    predicted = {}
     for side, (content, posterior) in checked.items():
         fitted_f_number = models[side].camera.lens.f_number
-        found[side] = _side(content, posterior, fitted_f_number, plan, side, changes, light_std, fitted)
+        predicted[side] = _side(content, posterior, fitted_f_number, plan, side, changes, light_std, fitted)
     return SealedPrediction(
-        model=model, plan=plan.source, changes=changes, sides=found,
+        model=model, plan=plan.source, changes=changes, sides=predicted,
         cameras={side: content.camera.model_dump_json() for side, (content, _) in checked.items()},
     )  # fmt: skip
 
@@ -125,7 +125,7 @@ def posterior_of(content: CameraFile) -> ModelPosterior:
     return ModelPosterior.of(first, tuple(known), np.zeros(len(known)), np.diag(variances))
 
 
-def measured_blocks(
+def measure_blocks(
     dataset: Dataset, quantities: tuple[Measurement, ...] = QUANTITIES
 ) -> tuple[list[Observable], list[Skipped]]:
     """Return the blocks that the recordings determine, with the numbers that a twin predicts, and why others are
@@ -166,7 +166,7 @@ def _side(
     session = future_session(content, plan, side, changes, dn_per_photon=None if light is None else light.dn_per_dose())
     captures = session.captures(side=side)
     dataset, growth_std = _dataset(content, posterior, session, side)
-    blocks, skipped = measured_blocks(dataset, QUANTITIES if light is None else (*QUANTITIES, PHOTON_TRANSFER))
+    blocks, skipped = measure_blocks(dataset, QUANTITIES if light is None else (*QUANTITIES, PHOTON_TRANSFER))
     if not blocks:
         raise InputError(
             f"{plan.source}: nothing can be predicted ({skipped[0].reason}); plan other captures or changes"
@@ -223,34 +223,34 @@ def _names(
         moved = sum((value * columns[name] for name, value in shift.items() if name in columns), np.zeros_like(mean))
         return tuple(float(f"{v:.9g}") for v in (mean + model.mean(acting) - base + moved)[use])
 
-    found = []
+    names = []
     for doubt in posterior.doubts:
         kept = tuple(e for e in content.effects if e.name not in doubt.named)
         rivals = [
             PredictedRival(
-                name=one.name,
-                probability=one.probability,
+                name=rival.name,
+                probability=rival.probability,
                 numbers=numbers(
                     effects_at_f_number(
-                        (*(e.effect() for e in one.effects), *kept),
+                        (*(e.effect() for e in rival.effects), *kept),
                         fitted_f_number,
                         content.camera.lens.f_number,
                     ),
-                    one.shift,
+                    rival.shift,
                 ),
             )
-            for one in doubt.rivals
+            for rival in doubt.rivals
         ]
-        found.append(
+        names.append(
             PredictedName(effect=doubt.effect, told=doubt.told, probability=doubt.probability, rivals=tuple(rivals))
         )
-    told = {doubt.effect for doubt in posterior.doubts}
+    doubtful = {doubt.effect for doubt in posterior.doubts}
     for i, effect in enumerate(content.effects):
-        if effect.name not in told and not isinstance(effect, ModelDiscrepancy | EmpiricalLaw | OtherFNumber):
+        if effect.name not in doubtful and not isinstance(effect, ModelDiscrepancy | EmpiricalLaw | OtherFNumber):
             rest = (*content.effects[:i], *content.effects[i + 1 :])
             absent = PredictedRival(name="", probability=0.0, numbers=numbers(rest, {}))
-            found.append(PredictedName(effect=effect.name, told=effect.name, probability=1.0, rivals=(absent,)))
-    return tuple(found)
+            names.append(PredictedName(effect=effect.name, told=effect.name, probability=1.0, rivals=(absent,)))
+    return tuple(names)
 
 
 def _dataset(
@@ -350,7 +350,7 @@ def _distribution(
         for name, by in zip(light.parameters, light.by.T, strict=True):
             columns[name] = columns.get(name, 0.0) + rates @ by
     jacobian = np.column_stack([*columns.values(), np.zeros((len(covariance), 0))])
-    mean, known = posterior.taken(list(columns))
+    mean, known = posterior.select(list(columns))
     covariance += jacobian @ known @ jacobian.T
     shift += sum((mean[k] * mean_columns[name] for k, name in enumerate(columns) if name in mean_columns), shift * 0.0)
     if growth_std:
@@ -398,8 +398,8 @@ def _hold_what_is_corrected(
 
 
 def correction_covariance(correction: ModelDiscrepancy, x: FloatArray) -> FloatArray:
-    """Covariance (n, n) of what a correction's factor is wrong by at places `x` (n,) of its axis: its factors scatter
-    from place to place, and drift, and both go on between and beyond them.
+    """Return the covariance (n, n) of what a correction's factor is wrong by at places `x` (n,) of its axis: its
+    factors scatter from place to place, and drift, and both go on between and beyond them.
 
     With g(d) half the mean squared difference of factors that are d apart, c + b d by least squares, and w (n, k) the
     weights by which the correction is drawn through its k factors, the error f - w f_k has the covariance
@@ -412,7 +412,7 @@ def correction_covariance(correction: ModelDiscrepancy, x: FloatArray) -> FloatA
     lag, half = np.abs(np.subtract.outer(at, at)), 0.5 * np.subtract.outer(correction.factor, correction.factor) ** 2
     near = np.triu(lag <= 0.5 * np.ptp(at), 1)
     (alone, drift), _ = nnls(np.column_stack([np.ones(near.sum()), lag[near]]), half[near])
-    weights = np.array([np.interp(x, at, one) for one in np.eye(len(at))]).T
+    weights = np.array([np.interp(x, at, unit) for unit in np.eye(len(at))]).T
 
     def apart(places: FloatArray) -> FloatArray:
         return drift * np.abs(np.subtract.outer(places, places)) + alone * (1.0 - np.eye(len(places)))
@@ -437,11 +437,11 @@ def _without_nuisances(block: Observable) -> Observable:
 
 def _patch_columns(block: Observable, at: slice, size: int) -> dict[str, FloatArray]:
     """Derivatives (size,) of all numbers by the patches' relative reflectances, by name."""
-    found: dict[str, FloatArray] = {}
+    columns: dict[str, FloatArray] = {}
     for row, label in enumerate(block.labels):
-        column = found.setdefault(f"{PATCH}{label.condition}:{label.channel}", np.zeros(size))
+        column = columns.setdefault(f"{PATCH}{label.condition}:{label.channel}", np.zeros(size))
         column[at.start + row] = block.scale[row]
-    return found
+    return columns
 
 
 def _numbers(
@@ -449,7 +449,7 @@ def _numbers(
 ) -> list[PredictedNumber]:
     """Every number, with how it follows exposure, temperature and level."""
     noise, more, offset = dataset.noise, added_dark_e_per_s(dataset, effects), dataset.offset(effects)
-    found = []
+    numbers = []
     for block, at in zip(model.blocks, model.slices, strict=True):
         name = block.measurement.name
         levels = np.array([label.x for label in block.labels])
@@ -477,7 +477,7 @@ def _numbers(
                     "dark": rate * capture.exposure_s,
                     "warmth_per_c": warmth,
                 }
-            found.append(
+            numbers.append(
                 PredictedNumber.model_validate(
                     {
                         "quantity": name, "captures": label.captures, "channel": label.channel,
@@ -486,4 +486,4 @@ def _numbers(
                     }
                 )
             )  # fmt: skip
-    return found
+    return numbers

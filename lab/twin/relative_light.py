@@ -47,7 +47,7 @@ class RelativeLight:
     covariance: FloatArray
 
     def dn_per_dose(self) -> float:
-        """Rate of the brightest lamp and channel, DN."""
+        """Return the rate of the brightest lamp and channel, DN."""
         return max(base * (1.0 + RATE_STD * z) for base, z in zip(self.per_dose.values(), self.value, strict=True))
 
     def about(self, per_dose: Mapping[str, float]) -> RelativeLight:
@@ -88,7 +88,7 @@ def relative_light(dataset: Dataset, effects: Effects, posterior: ModelPosterior
         for c, column in zip(coords, by_effect, strict=True)
         if (name := coordinate_name(acting, c)) in posterior.names
     }
-    mean, _ = posterior.taken(list(known))
+    mean, _ = posterior.select(list(known))
     jacobian = np.column_stack([*known.values(), np.zeros((len(block.value), 0))])
     noise = block.covariance + sum((np.outer(c, c) for c in columns.values()), np.zeros_like(block.covariance))
     of_rates = np.column_stack(list(rates.values()))
@@ -101,19 +101,19 @@ def relative_light(dataset: Dataset, effects: Effects, posterior: ModelPosterior
 
 
 def rates_per_dose(dataset: Dataset, block: Observable) -> dict[str, float]:
-    """DN for a unit of dose, in the baseline's linear response, by the name of each rate."""
+    """Return DN for a unit of dose, in the baseline's linear response, by the name of each rate."""
     dose = doses(dataset, block)
-    found = {}
+    rates = {}
     for name, column in block.predict(()).jacobian.items():
         if name.startswith(RATE) and column.any():
             mine = column != 0.0
-            found[name] = float(np.median(column[mine] / RATE_STD / dose[mine]))
-    return found
+            rates[name] = float(np.median(column[mine] / RATE_STD / dose[mine]))
+    return rates
 
 
 def doses(dataset: Dataset, block: Observable) -> FloatArray:
-    """Dose (n,) of the flats' means: photons a pixel, or electrons by the stated radiance and curves."""
-    found = []
+    """Return the dose (n,) of the flats' means: photons a pixel, or electrons by the stated radiance and curves."""
+    dose = []
     for label in block.labels:
         capture = dataset.recordings.capture(label.captures[0])
         light = reading(dataset, capture)  # type: ignore[arg-type]
@@ -121,5 +121,5 @@ def doses(dataset: Dataset, block: Observable) -> FloatArray:
         rate = light.photons_per_s
         if light.path is not None:
             rate = electron_rate(dataset.camera, label.channel, dataset.spectrum(light.path))
-        found.append(rate * capture.exposure_s)
-    return np.array(found)
+        dose.append(rate * capture.exposure_s)
+    return np.array(dose)

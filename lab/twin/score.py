@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from lab.capture_kinds.base import Capture
 from lab.errors import InputError
-from lab.formats.camera_file import lens_cache, traced_table
+from lab.formats.camera_file import lens_cache, trace_table
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
 from lab.observables.dataset import Dataset
@@ -22,7 +22,7 @@ from lab.observables.gaussian import chi2
 from lab.observables.observable import Label, measurement_title
 from lab.one_blas_thread import one_blas_thread
 from lab.shown import Tabular
-from lab.twin.predict import QUANTITIES, is_predicted, measured_blocks
+from lab.twin.predict import QUANTITIES, is_predicted, measure_blocks
 from lab.twin.sealed import PredictedName, PredictedNumber, SealedPrediction, SidePrediction, TwinNumber
 from sim.camera import CameraModel, Side
 from sim.optics.table import load_cached
@@ -113,13 +113,13 @@ class TestedEffect(Frozen):
     def words(self) -> str:
         """The verdict as a lab reads it, with the figures that it rests on."""
         title = self.name.replace("_", " ")
-        other = (self.becomes or "").replace("_", " ")
+        replacement = (self.becomes or "").replace("_", " ")
         was = next((rival.before for rival in self.rivals if rival.name == self.becomes), self.before)
         shares = f"probability {self.probability:.3g}, before {was:.2g}"
         if self.verdict == "named":
-            return f"{title}: is {other} ({shares})"
+            return f"{title}: is {replacement} ({shares})"
         if self.verdict == "withdrawn" and self.becomes is not None:
-            return f"{title}: withdrawn: {other} predicted the session ({shares})"
+            return f"{title}: withdrawn: {replacement} predicted the session ({shares})"
         return f"{title}: {self.verdict} (log likelihood {self.gain:+.1f})"
 
 
@@ -142,25 +142,27 @@ def conclusion(effects: Sequence[TestedEffect]) -> str:
     """Return what is named of one camera after its tests, in a line: names that stand, those that were withdrawn, and
     those that the session doesn't test."""
 
-    def listed(*verdicts: TwinVerdict) -> str:
-        mine = [one for one in effects if one.verdict in verdicts]
-        return ", ".join((one.becomes or one.name).replace("_", " ") for one in mine)
+    def join_names(*verdicts: TwinVerdict) -> str:
+        mine = [effect for effect in effects if effect.verdict in verdicts]
+        return ", ".join((effect.becomes or effect.name).replace("_", " ") for effect in mine)
 
-    gone = [one for one in effects if one.verdict == "withdrawn"]
+    gone = [effect for effect in effects if effect.verdict == "withdrawn"]
     named = ", ".join(
-        f"{one.becomes} in place of {one.name}".replace("_", " ") for one in gone if one.becomes is not None
+        f"{effect.becomes} in place of {effect.name}".replace("_", " ") for effect in gone if effect.becomes is not None
     )
     parts = {
-        "stands": ", ".join(filter(None, (listed("survives", "named"), named))) or "no name",
-        "withdrawn": ", ".join(one.name.replace("_", " ") for one in gone),
-        "untested": listed("untested"),
+        "stands": ", ".join(filter(None, (join_names("survives", "named"), named))) or "no name",
+        "withdrawn": ", ".join(effect.name.replace("_", " ") for effect in gone),
+        "untested": join_names("untested"),
     }
     return "; ".join(f"{key}: {said}" for key, said in parts.items() if said)
 
 
 @one_blas_thread
 def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
-    """Predicted beside measured. Raises InputError where the recordings aren't of the session that was predicted."""
+    """Compare a sealed prediction with the measured session. Raises InputError where the recordings aren't of the
+    session that was predicted.
+    """
     for side, prediction in sealed.sides.items():
         check_session(prediction, recordings, side)
     numbers: list[ScoredNumber] = []
@@ -175,7 +177,7 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
         of_edges = [number.x for number in prediction.numbers if number.quantity == SLANTED_EDGE.name]
         if of_edges:
             dataset.highest_cy_per_px = min(of_edges) / REAL_AT[0]
-        blocks, left_out = measured_blocks(dataset, tuple(m for m in SCORED if m.name in wanted))
+        blocks, left_out = measure_blocks(dataset, tuple(m for m in SCORED if m.name in wanted))
         skipped += left_out
         measured = {
             _key(b.measurement.name, label): (float(v), label.x)
@@ -189,25 +191,29 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
             if b.measurement is SLANTED_EDGE
             for v, label in zip(b.predict(()).mean, b.labels, strict=True)
         }
-        here = [i for i, number in enumerate(prediction.numbers) if number.key in measured]
-        missing += len(prediction.numbers) - len(here)
-        if not here:
+        present = [i for i, number in enumerate(prediction.numbers) if number.key in measured]
+        missing += len(prediction.numbers) - len(present)
+        if not present:
             raise InputError(
                 f"{recordings.source}: none of the {side} camera's predicted numbers is measured there; give the "
                 "session that was predicted"
             )
-        moved = np.array([_moved(prediction.numbers[i], prediction, recordings, measured, bare) for i in here])
-        seen = np.array([measured[prediction.numbers[i].key][0] for i in here])
-        covariance = _square(prediction)[np.ix_(here, here)]
+        moved = np.array(
+            [_predict_at_settings(prediction.numbers[i], prediction, recordings, measured, bare) for i in present]
+        )
+        seen = np.array([measured[prediction.numbers[i].key][0] for i in present])
+        covariance = _square(prediction)[np.ix_(present, present)]
         whole += chi2(seen - moved, covariance)
-        for name in dict.fromkeys(prediction.numbers[i].quantity for i in here):
-            mine = np.array([prediction.numbers[i].quantity == name for i in here])
+        for name in dict.fromkeys(prediction.numbers[i].quantity for i in present):
+            mine = np.array([prediction.numbers[i].quantity == name for i in present])
             parts[name] = parts.get(name, 0.0) + chi2((seen - moved)[mine], covariance[np.ix_(mine, mine)])
-        at = np.array([prediction.numbers[i].predicted for i in here])
-        for told in prediction.names:
-            changes = [np.array(rival.numbers)[here] - at for rival in told.rivals]
-            effects.append(_tested(side, told, seen - moved, changes, covariance))
-        numbers += [_scored(side, prediction.numbers[i], m, v) for i, m, v in zip(here, moved, seen, strict=True)]
+        at = np.array([prediction.numbers[i].predicted for i in present])
+        for predicted_name in prediction.names:
+            changes = [np.array(rival.numbers)[present] - at for rival in predicted_name.rivals]
+            effects.append(_weigh_name(side, predicted_name, seen - moved, changes, covariance))
+        numbers += [
+            _score_number(side, prediction.numbers[i], m, v) for i, m, v in zip(present, moved, seen, strict=True)
+        ]
     return TwinScore(
         source=recordings.source, quantities=tuple(_quantity(name, numbers, value) for name, value in parts.items()),
         effects=tuple(effects), chi2=whole, n=len(numbers), numbers=tuple(numbers), missing=missing,
@@ -225,7 +231,7 @@ def _camera(sealed: SealedPrediction, side: Side) -> CameraModel:
         table = load_cached(lens_cache(), wanted)
         file = sealed.changes.lens
         if table is None and file is not None and file.is_file():
-            table = traced_table(file)
+            table = trace_table(file)
         if table is None or table.content_hash != wanted:
             where = f"lens: {file}" if file is not None else f"the {side} camera's lens"
             raise InputError(
@@ -247,9 +253,9 @@ def check_session(prediction: SidePrediction, recordings: RecordingSet, side: Si
             is_same = abs(there / wanted - 1.0) <= MOST_F_NUMBER
         if not is_same:
             raise InputError(f"{isnt} {key} of the {side} camera is {there}, predicted {wanted}; give that session")
-    found = {c.id: c for c in recordings.captures(side=side)}
+    taken_captures = {c.id: c for c in recordings.captures(side=side)}
     for planned in prediction.captures:
-        taken = found.get(planned.id)
+        taken = taken_captures.get(planned.id)
         if taken is None or taken.kind != planned.kind:
             raise InputError(f"{isnt} it has no {planned.kind} capture {planned.id}; give that session")
         for key, there, wanted, most in _settings(taken, planned):
@@ -259,17 +265,17 @@ def check_session(prediction: SidePrediction, recordings: RecordingSet, side: Si
 
 def _settings(taken: Capture, planned: Capture) -> list[tuple[str, float, float, float]]:
     """(key, as taken, as predicted, largest difference)."""
-    found = [
+    settings = [
         ("gain_db", taken.gain_db or 0.0, planned.gain_db or 0.0, 0.01),
         ("exposure_s", taken.exposure_s, planned.exposure_s, MOST_EXPOSURE * planned.exposure_s),
     ]
     if taken.temperature_c is not None and planned.temperature_c is not None:
-        found.append(("temperature_c", taken.temperature_c, planned.temperature_c, MOST_C))
+        settings.append(("temperature_c", taken.temperature_c, planned.temperature_c, MOST_C))
     for key in ("corners", "region"):
         there, wanted = (np.ravel(getattr(c, key, None) or 0.0) for c in (taken, planned))
         if there.shape == wanted.shape:
-            found += [(key, float(a), float(b), MOST_PX) for a, b in zip(there, wanted, strict=True)]
-    return found
+            settings += [(key, float(a), float(b), MOST_PX) for a, b in zip(there, wanted, strict=True)]
+    return settings
 
 
 def _with_curves(recordings: RecordingSet, prediction: SidePrediction, camera: CameraModel, side: Side) -> RecordingSet:
@@ -288,7 +294,7 @@ def _key(quantity: str, label: Label) -> tuple[object, ...]:
     ).key  # fmt: skip
 
 
-def _moved(
+def _predict_at_settings(
     number: PredictedNumber,
     prediction: SidePrediction,
     recordings: RecordingSet,
@@ -319,15 +325,15 @@ def _square(prediction: SidePrediction) -> FloatArray:
     return np.asarray(out + np.tril(out, -1).T)
 
 
-def _tested(
+def _weigh_name(
     side: Side, name: PredictedName, residual: FloatArray, changes: list[FloatArray], covariance: FloatArray
 ) -> TestedEffect:
     """Weigh a name against its rivals, which change the prediction by `changes` (n,) each. Log likelihoods are tempered
     by chi2 / n of the best of them where that is above 1: what none predicts counts for none."""
     fits = [chi2(residual - change, covariance) for change in changes]
-    own = chi2(residual, covariance)
-    tempered = max(min(own, *fits) / len(residual), 1.0)
-    gains = [0.5 * (own - fit) / tempered for fit in fits]
+    present = chi2(residual, covariance)
+    tempered = max(min(present, *fits) / len(residual), 1.0)
+    gains = [0.5 * (present - fit) / tempered for fit in fits]
     is_told = any(0.5 * chi2(change, covariance) >= LEAST_GAIN for change in changes)
     absent = -next((gain for rival, gain in zip(name.rivals, gains, strict=True) if not rival.name), 0.0)
     rivals = [
@@ -336,18 +342,18 @@ def _tested(
         if rival.name
     ]
     plain = TestedEffect(side=side, name=name.told, effect=name.effect, gain=absent, before=name.probability)
-    return _judged(plain, rivals, is_told)
+    return _judge(plain, rivals, is_told)
 
 
-def _judged(plain: TestedEffect, rivals: Sequence[TestedRival], is_told: bool) -> TestedEffect:
+def _judge(plain: TestedEffect, rivals: Sequence[TestedRival], is_told: bool) -> TestedEffect:
     """Return the verdict on a name by its gain over nothing and the gains of its rivals over it."""
     weights = {plain.effect: float(np.log(max(plain.before, LEAST_PROBABILITY)))}
-    weights |= {one.name: float(np.log(max(one.before, LEAST_PROBABILITY))) + one.gain for one in rivals}
+    weights |= {rival.name: float(np.log(max(rival.before, LEAST_PROBABILITY))) + rival.gain for rival in rivals}
     top = max(weights.values())
     whole = sum(np.exp(w - top) for w in weights.values())
     after = {key: float(np.exp(w - top) / whole) for key, w in weights.items()}
     likeliest = max(after, key=lambda key: after[key])
-    gain = {one.name: one.gain for one in rivals} | {plain.effect: 0.0}
+    gain = {rival.name: rival.gain for rival in rivals} | {plain.effect: 0.0}
     verdict: TwinVerdict = "survives" if plain.gain > 0 else "withdrawn"
     becomes = None
     is_another = likeliest != plain.effect or plain.name != plain.effect
@@ -361,31 +367,33 @@ def _judged(plain: TestedEffect, rivals: Sequence[TestedRival], is_told: bool) -
             "verdict": verdict,
             "becomes": becomes,
             "probability": after[becomes or plain.effect],
-            "rivals": tuple(one.model_copy(update={"after": after[one.name]}) for one in rivals),
+            "rivals": tuple(rival.model_copy(update={"after": after[rival.name]}) for rival in rivals),
         }
     )
 
 
-def together(tests: Sequence[Sequence[TestedEffect]]) -> tuple[TestedEffect, ...]:
+def combine_sessions(tests: Sequence[Sequence[TestedEffect]]) -> tuple[TestedEffect, ...]:
     """Return what several sessions say together of the names of one model: log likelihoods add up."""
-    found: dict[tuple[Side, str], list[TestedEffect]] = {}
+    members_of: dict[tuple[Side, str], list[TestedEffect]] = {}
     for session in tests:
-        for one in session:
-            found.setdefault((one.side, one.effect), []).append(one)
+        for test in session:
+            members_of.setdefault((test.side, test.effect), []).append(test)
     whole = []
-    for members in found.values():
-        told = [one for one in members if one.verdict != "untested"]
+    for members in members_of.values():
+        decisive = [test for test in members if test.verdict != "untested"]
         first = members[0]
         rivals = [
-            rival.model_copy(update={"gain": sum(r.gain for one in told for r in one.rivals if r.name == rival.name)})
+            rival.model_copy(
+                update={"gain": sum(r.gain for test in decisive for r in test.rivals if r.name == rival.name)}
+            )
             for rival in first.rivals
         ]
-        plain = first.model_copy(update={"gain": sum(one.gain for one in told)})
-        whole.append(_judged(plain, rivals, bool(told)))
+        plain = first.model_copy(update={"gain": sum(test.gain for test in decisive)})
+        whole.append(_judge(plain, rivals, bool(decisive)))
     return tuple(whole)
 
 
-def _scored(side: Side, number: PredictedNumber, moved: float, seen: float) -> ScoredNumber:
+def _score_number(side: Side, number: PredictedNumber, moved: float, seen: float) -> ScoredNumber:
     away = seen - moved
     return ScoredNumber(
         side=side, quantity=number.quantity, captures=number.captures, channel=number.channel, where=number.where,
@@ -407,5 +415,9 @@ def _quantity(name: str, numbers: list[ScoredNumber], value: float) -> QuantityS
 
 
 def title(quantity: str) -> str:
-    """Return a quantity as a lab reads it."""
+    """Return the name of a predicted quantity in words.
+
+    >>> title("slanted_edge")
+    'transfer function of slanted edges'
+    """
     return measurement_title(quantity)

@@ -104,7 +104,11 @@ class SealedPrediction(Tabular, Frozen):
 
 
 def seal_path(file: Path) -> Path:
-    """Return the file that holds the hash of `file`."""
+    """Return the file beside a sealed one that holds its SHA-256.
+
+    >>> seal_path(Path("prediction.json")).name
+    'prediction.json.sha256'
+    """
     return file.with_name(file.name + ".sha256")
 
 
@@ -113,22 +117,22 @@ def seal(prediction: SealedPrediction, file: Path) -> str:
     text = (
         json.dumps(prediction.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), ensure_ascii=True) + "\n"
     )
-    found = hashlib.sha256(text.encode()).hexdigest()
-    for path, content in ((file, text), (seal_path(file), f"{found}  {file.name}\n")):
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    for path, content in ((file, text), (seal_path(file), f"{digest}  {file.name}\n")):
         with replacing(path) as partial:
             partial.write_text(content, encoding="utf-8")
-    return found
+    return digest
 
 
 def open_seal(file: Path, expected: str | None = None) -> SealedPrediction:
     """Read a sealed prediction. Raises InputError where its hash isn't `expected` (None: the one beside it)."""
     try:
-        found = hashlib.sha256(file.read_bytes()).hexdigest()
-        told = expected or seal_path(file).read_text(encoding="utf-8").split()[0]
+        digest = hashlib.sha256(file.read_bytes()).hexdigest()
+        sealed_digest = expected or seal_path(file).read_text(encoding="utf-8").split()[0]
     except (OSError, UnicodeDecodeError, IndexError) as error:
         raise InputError(f"{file}: it or its hash {seal_path(file).name} can't be read; give both files") from error
-    if found != told.lower():
+    if digest != sealed_digest.lower():
         raise InputError(
-            f"{file}: was edited: its SHA-256 is {found}, sealed was {told}; take the file that was sealed"
+            f"{file}: was edited: its SHA-256 is {digest}, sealed was {sealed_digest}; take the file that was sealed"
         )
     return read_result(SealedPrediction, file)

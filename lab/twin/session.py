@@ -50,7 +50,7 @@ def future_session(
     doesn't say where its edges are, or holds several gains."""
     stated = plan.camera(side)
     check_sensor(content, stated, plan.source)
-    captures = [_changed(c, changes) for c in plan.captures(side=side) if isinstance(c, PREDICTED)]
+    captures = [_change_settings(c, changes) for c in plan.captures(side=side) if isinstance(c, PREDICTED)]
     gains = {c.gain_db or 0.0 for c in captures}
     if not captures or len(gains) > 1:
         what = f"{len(gains)} gains" if captures else "no darks, flats, charts or edges"
@@ -67,7 +67,7 @@ def future_session(
     pitch = {} if stated.pixel_pitch_um is None else {"pixel_pitch_um": content.camera.pixel_pitch_um}
     sheet = stated.model_copy(update={"quantum_efficiency": curves} | of_lens | pitch)
     manifest = plan.manifest.model_copy(update={"cameras": {side: sheet}, "captures": tuple(captures)})
-    frames = _drawn(content, captures, spectra, plan, seed, dn_per_photon)
+    frames = _draw_frames(content, captures, spectra, plan, seed, dn_per_photon)
     frames |= _charts(content, captures, frames, plan)
     return RecordingSet(manifest, files=MemoryFiles(frames, spectra, {}), source=plan.source)
 
@@ -87,7 +87,7 @@ def light_path(capture: Capture) -> str | None:
     return getattr(capture, "radiance", None) or getattr(capture, "light_radiance", None)
 
 
-def _changed(capture: Capture, changes: Changes) -> Capture:
+def _change_settings(capture: Capture, changes: Changes) -> Capture:
     update: dict[str, Any] = {"exposure_s": capture.exposure_s * (changes.exposure_factor or 1.0)}
     if changes.gain_db is not None:
         update["gain_db"] = changes.gain_db
@@ -99,7 +99,7 @@ def _changed(capture: Capture, changes: Changes) -> Capture:
     return capture.model_copy(update=update)
 
 
-def _drawn(
+def _draw_frames(
     content: CameraFile,
     captures: list[Capture],
     spectra: dict[str, Spectrum],
@@ -121,8 +121,8 @@ def _drawn(
         elapsed = 0.0 if first.time is None else first.time.timestamp() - start
         scene = _scene(members, spectra, plan, content.camera, dn_per_photon)
         exposure = Exposure(scene, first.exposure_s, first.gain_db or 0.0, first.temperature_c, elapsed, placed="image")
-        told = [c.model_dump(exclude={"id", "frame", "time"}) for c in members]
-        key = repr(told) if is_steady(camera, effects) else path
+        settings = [c.model_dump(exclude={"id", "frame", "time"}) for c in members]
+        key = repr(settings) if is_steady(camera, effects) else path
         if kept[0] != key:
             kept = key, expected_electrons(camera, exposure, effects)
         frames[path] = sensor.sample_from(
@@ -156,17 +156,17 @@ def _scene(
             raise InputError(f"{source}: {first.id} has no radiance; state the light that it will have, or its photons")
         return scene
     regions = []
-    for one in members:
-        if not isinstance(one, SlantedEdgeCapture) or one.region is None or one.angle_deg is None:
-            raise InputError(f"{source}: {one.id} has no region and angle_deg; state where its edge will be")
-        if one.light_radiance is None:
-            raise InputError(f"{source}: {one.id} has no light_radiance; state the light that it will have")
-        regions.append(EdgeRegion(one.region, one.angle_deg))
+    for edge in members:
+        if not isinstance(edge, SlantedEdgeCapture) or edge.region is None or edge.angle_deg is None:
+            raise InputError(f"{source}: {edge.id} has no region and angle_deg; state where its edge will be")
+        if edge.light_radiance is None:
+            raise InputError(f"{source}: {edge.id} has no light_radiance; state the light that it will have")
+        regions.append(EdgeRegion(edge.region, edge.angle_deg))
     light = spectra[first.light_radiance or ""]
     return KnifeEdge(tuple(regions), light.scale(_dark_share(first, camera, plan)), light)
 
 
-def _planned(plan: RecordingSet, capture: Capture) -> np.ndarray[Any, Any] | None:
+def _read_planned_frame(plan: RecordingSet, capture: Capture) -> np.ndarray[Any, Any] | None:
     """Return the frame that the plan has of a capture; None where it is a plan alone."""
     try:
         return plan.frame(plan.capture(capture.id)).astype(float)
@@ -176,7 +176,7 @@ def _planned(plan: RecordingSet, capture: Capture) -> np.ndarray[Any, Any] | Non
 
 def _dark_share(edge: Capture, camera: CameraModel, plan: RecordingSet) -> float:
     """Light of an edge's dark side over that of its light one, as the plan's frame shows it; 0 without one."""
-    frame = _planned(plan, edge)
+    frame = _read_planned_frame(plan, edge)
     if frame is None or not isinstance(edge, SlantedEdgeCapture) or edge.region is None:
         return 0.0
     row0, col0, row1, col1 = edge.region
@@ -189,9 +189,9 @@ def _charts(
 ) -> dict[str, np.ndarray[Any, Any]]:
     """Frames of the chart in its surroundings, by path: those that the plan has, at the levels of the drawn ones. What
     stands around the patches sends light into them, and no manifest says what that is."""
-    camera, found = content.camera, {}
+    camera, frames = content.camera, {}
     for capture in captures:
-        frame = _planned(plan, capture) if isinstance(capture, ChartCapture) else None
+        frame = _read_planned_frame(plan, capture) if isinstance(capture, ChartCapture) else None
         if frame is None or not isinstance(capture, ChartCapture):
             continue
         black, new = camera.black_level_dn, drawn[capture.frame].astype(float)
@@ -205,8 +205,8 @@ def _charts(
             there = mask & inside
             factor = (new[there].mean() - black) / max(frame[there].mean() - black, 1e-9)
             out[mask] = black + factor * (frame[mask] - black)
-        found[capture.frame] = np.clip(np.round(out), 0, camera.white_level_dn).astype(drawn[capture.frame].dtype)
-    return found
+        frames[capture.frame] = np.clip(np.round(out), 0, camera.white_level_dn).astype(drawn[capture.frame].dtype)
+    return frames
 
 
 def _patch_centres(capture: ChartCapture, shape: tuple[int, ...]) -> np.ndarray[Any, Any]:

@@ -32,6 +32,7 @@ class Trails:
     releases : (share of the traps, time constant of their release in transfers) of each species; the shares' sum is 1
     output : whether the first or the last line is next to the output, and so is transferred once
     at_once : whether the traps of all of a packet's transfers act as those of a single one
+    fills : whether each packet fills the traps to its own level, whatever they hold
 
     A packet that is transferred n times loses n loss, and the packet j places behind it finds sum_s w_s (1 - b_s)
     b_s^(j - 1) of that, b_s = exp(-1 / release). With T this delay, the limit of many small losses is exp(n loss (T -
@@ -41,6 +42,12 @@ class Trails:
     `at_once`: the traps of n transfers fill to g N of N electrons that are left, g = n loss / b, and keep n loss / (1 +
     g) of the packet; what they release finds them full: 1 + n loss / (1 + g) (T - 1). It is the model of A. Short et
     al., MNRAS 430 (2013) 3078, of the same loss for few transfers, less for many.
+
+    `fills`: capture is fast, and traps that hold charge of packets before take less. Of equal packets they hold that of
+    one, not the sum, so that a margin behind an area of even light reads n loss N in all: the deferred charge by which
+    the extended pixel edge response defines the inefficiency. Where each packet loses its share to traps however full,
+    it is n loss N / (1 - b). Within the active area both are taken alike: the difference is a share loss b / (1 - b) of
+    even light, and edges.
     """
 
     axis: Literal[0, 1]
@@ -48,6 +55,7 @@ class Trails:
     releases: tuple[tuple[float, float], ...]
     output: Literal["first", "last"]
     at_once: bool = False
+    fills: bool = False
 
     def transfers(self, line: FloatArray, lines: int) -> FloatArray:
         """Return the number of transfers of lines 0 .. lines - 1, which may lie between two."""
@@ -61,21 +69,32 @@ class Trails:
             species.append((np.asarray(lost / (1.0 + lost / held)), held))
         return species
 
-    def clock(self, electrons: FloatArray) -> FloatArray:
+    def clock(self, electrons: FloatArray, margins: tuple[int, int] = (0, 0)) -> FloatArray:
         """Return the mean electrons (rows, cols) that are read, given those in the pixels.
 
         exp(n loss (T - 1)) of each source line by its own n, as the series of (T - 1)^m of n^m loss^m / m! times the
         source. What is released behind the last line isn't in the frame.
+
+        margins : lines before the first active one and behind the last one (`Margins.lines`). Transfers are counted
+            from the first active line on, so that the active area is read as it would be without them
         """
         packets = np.moveaxis(electrons, self.axis, 0)
+        ahead, behind = margins
         if self.output == "last":
-            packets = packets[::-1]
-        transfers = np.arange(1.0, len(packets) + 1.0)[:, None]
+            packets, ahead, behind = packets[::-1], behind, ahead
+        transfers = np.maximum(np.arange(1.0, len(packets) + 1.0) - ahead, 0.0)[:, None]
+        read = self._clock_in_order(packets, transfers)
+        if self.fills and behind:
+            read = np.concatenate([read[:-behind], self._read_behind(packets, transfers, behind)])
+        return self._as_given(read)
+
+    def _clock_in_order(self, packets: FloatArray, transfers: FloatArray) -> FloatArray:
+        """Return what is read of packets (lines, n) in the order of their transfers (lines, 1)."""
         if self.at_once:
             read = packets
             for kept, held in self._retain_at_once(transfers):
                 read = read + _release(kept * packets, held) - kept * packets
-            return self._as_given(read)
+            return read
         lost = self.loss * transfers
         terms, size = 1, 2.0 * float(lost[-1, 0])
         while size > LEAST_TERM:
@@ -87,7 +106,23 @@ class Trails:
         read = sources.pop()
         while sources:
             read = sources.pop() + self._delay(read) - read
-        return self._as_given(read)
+        return read
+
+    def _read_behind(self, packets: FloatArray, transfers: FloatArray, behind: int) -> FloatArray:
+        """Return what is read of the `behind` last lines of packets (lines, n), where traps are filled to the level of
+        each packet and keep the most that any has left them."""
+        lines = np.arange(1.0, behind + 1.0)[:, None]
+        before, total = packets[:-behind], packets[-behind:]
+        for share, release in self.releases:
+            held = float(np.exp(-1.0 / release))
+            left = -np.expm1(-self.loss * share * transfers[:-behind])
+            if self.at_once:
+                left = self.loss * share * transfers[:-behind]
+                left = left / (1.0 + left / held)
+            age = np.arange(len(before) - 1.0, -1.0, -1.0)[:, None]
+            most = np.max(left * before * held**age, axis=0, initial=0.0)
+            total = total + most * (1.0 - held) * held ** (lines - 1.0)
+        return total
 
     def _as_given(self, read: FloatArray) -> FloatArray:
         """Return lines in the order of their transfers as a frame (rows, cols)."""

@@ -75,7 +75,7 @@ def test_what_is_refused_is_an_exception_with_the_services_line(shared: Running)
 #: What a client of a program has no use for: the page's login.
 OF_THE_PAGE = {("POST", "/login"), ("POST", "/logout"), ("GET", "/halt")}
 #: Methods of the client that ask, and how; an archive's path gets the ending of the file that it is written to.
-ASKS = {"_get": "GET", "_pages": "GET", "_events": "GET", "_fetched": "GET", "_post": "POST", "_send": "POST"}
+ASKS = {"_get": "GET", "_pages": "GET", "_events": "GET", "_fetch": "GET", "_post": "POST", "_send": "POST"}
 
 
 def asked_by_the_client() -> set[tuple[str, str]]:
@@ -91,7 +91,7 @@ def asked_by_the_client() -> set[tuple[str, str]]:
         how = ASKS.get(call.func.attr) or next(
             (one for one in texts if one in ("GET", "PUT", "POST", "PATCH", "DELETE")), "GET"
         )
-        ending = ".{}" if call.func.attr == "_fetched" else ""
+        ending = ".{}" if call.func.attr == "_fetch" else ""
         found |= {(how, f"{path}{ending}") for path in paths}
     return found
 

@@ -229,14 +229,14 @@ def test_an_address_is_blocked_after_too_many_failures_and_recovers() -> None:
     failed = FailedKeys(most=3, per_s=0.5, clock=lambda: clock[0])
     for _ in range(3):
         assert failed.wait_s("192.0.2.1") == 0
-        failed.failed("192.0.2.1")
+        failed.count_failure("192.0.2.1")
     assert failed.wait_s("192.0.2.1") == 2  # one comes back in 1 / 0.5 s
     assert failed.wait_s("192.0.2.2") == 0
     clock[0] = 2.0
     assert failed.wait_s("192.0.2.1") == 0
     clock[0] = 1000.0
     for _ in range(3):
-        failed.failed("192.0.2.1")
+        failed.count_failure("192.0.2.1")
     assert failed.wait_s("192.0.2.1") == 2  # no more than three were saved up
 
 
@@ -245,7 +245,7 @@ def test_a_client_with_a_whole_network_is_one_address() -> None:
     assert network_of("::ffff:192.0.2.1") == "192.0.2.1"
     failed = FailedKeys()
     for number in range(ADDRESSES + 50):
-        failed.failed(f"10.{number >> 16}.{number >> 8 & 255}.{number & 255}")
+        failed.count_failure(f"10.{number >> 16}.{number >> 8 & 255}.{number & 255}")
     assert len(failed._left) == ADDRESSES  # no amount of addresses takes more memory
 
 

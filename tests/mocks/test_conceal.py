@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from evaluation.live import typical_spec
 from mocks.bench import MARGIN_PX, OVERSAMPLE, SCREEN_OVERSAMPLE, Bench
 from mocks.command import commands
-from mocks.conceal import NOT_SHOWN, OF_THE_RADIOMETER, SIDES, ConcealError, _made, parse
+from mocks.conceal import NOT_SHOWN, OF_THE_RADIOMETER, SIDES, ConcealError, _make_effect, parse
 from mocks.light_path import LightSettings
 from mocks.targets import ShownCells, scene
 from mocks.truth import HiddenCamera, hidden_truth
@@ -330,10 +330,10 @@ class _Rows(Effect):
 
 
 def test_integer_choices_are_concealed() -> None:
-    assert _made("left:rows:period=4,first_row=3", _Rows, "period=4,first_row=3") == _Rows(period=4, first_row=3)
+    assert _make_effect("left:rows:period=4,first_row=3", _Rows, "period=4,first_row=3") == _Rows(period=4, first_row=3)
     for text, complaint in (("period=5", "Input should be 4 or 8"), ("first_row=9", "less than 8")):
         with pytest.raises(ConcealError, match=complaint):
-            _made(f"left:rows:{text}", _Rows, text)
+            _make_effect(f"left:rows:{text}", _Rows, text)
 
 
 def test_an_effect_is_concealed_once() -> None:

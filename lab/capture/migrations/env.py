@@ -17,8 +17,8 @@ def run() -> None:
         with context.begin_transaction():
             context.run_migrations()
         return
-    with create_engine(Settings().url).connect() as own:
-        context.configure(connection=own, target_metadata=Base.metadata, render_as_batch=True)
+    with create_engine(Settings().url).connect() as connection:
+        context.configure(connection=connection, target_metadata=Base.metadata, render_as_batch=True)
         with context.begin_transaction():
             context.run_migrations()
 

@@ -18,6 +18,7 @@ from sim.effects.empirical_law import Along, Of, Stage
 from sim.spectrum import FloatArray
 
 PERIODS = tuple(range(2, 65))
+BIT_PERIODS = (128, 256, 512)  # of the codes of a converter whose higher bits are wrong, too
 #: Classes of a table, at most, that differ from all others where a table of few numbers is told.
 FEW_CLASSES, FEW_FROM = 2, 8
 UPPER_PERIODS = (2, 4, 8, 16)  # of tables that begin within the index
@@ -268,7 +269,7 @@ def periodic_forms(look: Look) -> Iterator[Form]:
         yield Form("periodic", np.eye(count), count - 1, share=0.5, period=count, centred=True)
         return
     span = int(np.ptp(look.seen.index)) + 1
-    for period in PERIODS:
+    for period in (*PERIODS, *(BIT_PERIODS if look.stage == "codes" else ())):
         if period * LEAST_REPEATS > span:
             break
         share = 0.5 / (period * (period - 1))  # of all periods together a half

@@ -45,7 +45,7 @@ from lab.formats.results import (
     PolicyRule,
     Rival,
 )
-from lab.formats.results.words import measured
+from lab.formats.results.words import format_value
 from lab.inference.check import RATE as HELD_OUT_RATE
 from lab.inference.posterior import LIKELIER, NAMED, Size
 from lab.inference.search import REFITS
@@ -340,7 +340,7 @@ def _is_size(declared: Mapping[str, Quantity], size: Size) -> bool:
 
 
 def _size(field: str, value: ParameterValue) -> str:
-    text = f"{plain_name(field, value.unit)} {measured(value.value, value.std, value.unit, value.shown_interval)}"
+    text = f"{plain_name(field, value.unit)} {format_value(value.value, value.std, value.unit, value.shown_interval)}"
     return text if value.is_determined else f"{text}, not determined"
 
 

@@ -8,7 +8,7 @@ from lab.formats.results import (
     Unexplained,
 )
 from lab.formats.results.plausible import FIGURES
-from lab.formats.results.words import measured
+from lab.formats.results.words import format_value
 from lab.observables.flats.linearity import PHOTON_TRANSFER, misstated_levels
 from lab.observables.spectra.light_readings import RADIOMETER_STD
 from sim.camera import Side
@@ -40,7 +40,7 @@ def impossible_efficiency(side: Side, fit: CameraFit | None) -> tuple[Unexplaine
             side=side,
             measurement=PHOTON_TRANSFER.name,
             axis=PHOTON_TRANSFER.axis,
-            where=f"quantum efficiency {measured(value, std)}",
+            where=f"quantum efficiency {format_value(value, std)}",
             shape="the stated numbers of photons are fewer than the electrons",
             significance_sigma=round(sigma, 2),
             chi2_before=sigma**2,

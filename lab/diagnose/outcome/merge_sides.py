@@ -31,7 +31,7 @@ from lab.formats.results import (
     ParameterValue,
     Rival,
 )
-from lab.formats.results.words import measured
+from lab.formats.results.words import format_value
 from lab.observables.observable import measurement_title
 from sim.camera import Side
 from sim.effects.library import effects as library
@@ -174,7 +174,7 @@ def _members(candidates: Sequence[Candidate]) -> tuple[Member, ...]:
 
 def _size(field: str, value: ParameterValue) -> str:
     """Return a parameter in words, with what its interval tells."""
-    text = f"{plain_name(field, value.unit)} {measured(value.value, value.std, value.unit, value.interval)}"
+    text = f"{plain_name(field, value.unit)} {format_value(value.value, value.std, value.unit, value.interval)}"
     return text if value.is_determined else f"{text}, not determined"
 
 

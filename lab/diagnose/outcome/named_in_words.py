@@ -8,7 +8,7 @@ import numpy as np
 
 from lab.effect_titles import effect_title
 from lab.formats.results import Combination, Member
-from lab.formats.results.words import measured
+from lab.formats.results.words import format_value
 from sim.effects.base import Effect
 from sim.effects.families import Family
 
@@ -77,7 +77,9 @@ def pooled(values: list[tuple[float, float | None]], is_shared: bool) -> tuple[f
 def combination_in_words(one: Combination) -> str:
     """Return in words what the recordings determine of parameters that they can't tell apart."""
     names = [f"{name}^{one.power}" if one.power > 1 else name for name in one.parameters]
-    return f"{sum_words(names, one.weights)} = {measured(one.value, one.std, one.unit)} is, of the {one.side} camera"
+    return (
+        f"{sum_words(names, one.weights)} = {format_value(one.value, one.std, one.unit)} is, of the {one.side} camera"
+    )
 
 
 def sum_words(names: Sequence[str], weights: Sequence[float]) -> str:

@@ -43,23 +43,23 @@ def level_consistency(
     recorded: RecordedLevels, dark: DarkSignal, saturation: Saturation, remarks: Remarks
 ) -> LevelConsistency:
     """Judge the flats of each lamp against each other, and report those that contradict the others."""
-    found: dict[int, InconsistentLevel] = {}
+    inconsistent: dict[int, InconsistentLevel] = {}
     scatter, noise, judged = 0.0, 0.0, 0
     for lamp in dict.fromkeys(level.lamp for level in recorded.flats):
-        own = [level for level in recorded.flats if level.lamp == lamp]
-        laws = _laws(own, [level.light for level in own], recorded, dark, saturation)
+        lamp_levels = [level for level in recorded.flats if level.lamp == lamp]
+        laws = _laws(lamp_levels, [level.light for level in lamp_levels], recorded, dark, saturation)
         if not laws:
             continue
-        if len(own) > judged:
+        if len(lamp_levels) > judged:
             scatter = float(np.mean([law.scatter for law in laws.values()]))
-            noise, judged = float(np.mean([law.noise for law in laws.values()])), len(own)
+            noise, judged = float(np.mean([law.noise for law in laws.values()])), len(lamp_levels)
         votes = np.mean([law.outlier for law in laws.values()], axis=0) >= 0.5
         for number in np.flatnonzero(votes):
-            level = own[number]
-            found[id(level)] = _describe(level, int(number), laws, recorded, dark, lamp)
-            sources = _source(own, int(number), recorded, dark, saturation)
-            remarks.add(_sentence(found[id(level)], sources))
-    rest = [level for level in recorded.flats if id(level) not in found]
+            level = lamp_levels[number]
+            inconsistent[id(level)] = _describe(level, int(number), laws, recorded, dark, lamp)
+            sources = _source(lamp_levels, int(number), recorded, dark, saturation)
+            remarks.add(_sentence(inconsistent[id(level)], sources))
+    rest = [level for level in recorded.flats if id(level) not in inconsistent]
     median = float(np.median([level.repeats for level in recorded.flats]))
     series = [level for level in rest if level.repeats < STACK_REPEATS * median]
     if len({level.light for level in series}) < LEAST_SERIES:
@@ -68,14 +68,14 @@ def level_consistency(
     return LevelConsistency(
         tuple(series),
         tuple(level for level in rest if id(level) not in kept),
-        tuple(found.values()),
+        tuple(inconsistent.values()),
         scatter,
         noise,
     )
 
 
 def _laws(
-    own: Sequence[MeasuredLevel],
+    levels: Sequence[MeasuredLevel],
     light: Sequence[float],
     recorded: RecordedLevels,
     dark: DarkSignal,
@@ -83,19 +83,19 @@ def _laws(
 ) -> dict[str, RobustResponse]:
     """Response of each plane to `light` (levels,)."""
     places = {id(level): number for number, level in enumerate(recorded.flats)}
-    found = {}
+    laws = {}
     for name in recorded.names:
-        signal = np.array([level.plane[name].mean - dark.mean_dn(name, level.exposure_s) for level in own])
-        noise = np.array([level.plane[name].mean_std for level in own])
+        signal = np.array([level.plane[name].mean - dark.mean_dn(name, level.exposure_s) for level in levels])
+        noise = np.array([level.plane[name].mean_std for level in levels])
         noise = np.where(np.isfinite(noise), noise, np.nanmax(noise, initial=0.0))
-        clipped = np.array([saturation.clipped[name][places[id(level)]] for level in own])
+        clipped = np.array([saturation.clipped[name][places[id(level)]] for level in levels])
         std = np.maximum(np.hypot(noise, _dark_scatter_dn(recorded, dark, name)), 1e-6 * saturation.signal_dn[name])
         law = robust_response(
             np.array(light), signal, std, saturation.signal_dn[name], clipped, np.random.default_rng(SEED)
         )
         if law is not None:
-            found[name] = law
-    return found
+            laws[name] = law
+    return laws
 
 
 def _dark_scatter_dn(recorded: RecordedLevels, dark: DarkSignal, name: str) -> float:
@@ -130,16 +130,16 @@ def _describe(
 
 
 def _source(
-    own: Sequence[MeasuredLevel], number: int, recorded: RecordedLevels, dark: DarkSignal, saturation: Saturation
+    levels: Sequence[MeasuredLevel], number: int, recorded: RecordedLevels, dark: DarkSignal, saturation: Saturation
 ) -> str:
     """Return what the exposure says where the light is a number of photons of its own."""
-    level = own[number]
+    level = levels[number]
     if level.light == level.exposure_s:
         return "either the exposure or the frames are of another level"
-    exposures = [each.exposure_s for each in own]
+    exposures = [each.exposure_s for each in levels]
     if len(set(exposures)) < LEAST_SERIES:
         return "either the photon number or the frames are of another level"
-    laws = _laws(own, exposures, recorded, dark, saturation)
+    laws = _laws(levels, exposures, recorded, dark, saturation)
     if not laws:
         return "either the photon number or the frames are of another level"
     if np.mean([law.outlier[number] for law in laws.values()]) >= 0.5:

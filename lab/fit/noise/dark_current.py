@@ -45,13 +45,13 @@ class SensorTemperature(Frozen):
         return "at an unknown temperature" if self.temperature_c is None else f"at {self.temperature_c:.1f} °C"
 
     def doublings(self, reference: SensorTemperature) -> tuple[float, float]:
-        """By how many times 2 a dark current at the reference's temperature is larger than at this one, and the
-        standard deviation.
+        """Return by how many doublings a dark current at the reference's temperature is larger than at this one, and
+        the standard deviation.
 
         The doubling temperature is the better known of both. Where a temperature isn't known, the number is 0 and its
         standard deviation that of the temperatures that a laboratory's sensors have.
         """
-        law = min(self, reference, key=lambda one: one.doubling_c_std)
+        law = min(self, reference, key=lambda sensor_law: sensor_law.doubling_c_std)
         if self.temperature_c is None or reference.temperature_c is None:
             unknown = (self.temperature_c is None) + (reference.temperature_c is None)
             return 0.0, math.sqrt(unknown) * UNKNOWN_C_STD / law.doubling_c
@@ -60,16 +60,24 @@ class SensorTemperature(Frozen):
         return rise_c / law.doubling_c, math.hypot(of_law, math.sqrt(2.0) * THERMOMETER_C_STD / law.doubling_c)
 
 
-def temperature_law(found: Sequence[tuple[float, float, float]], gain_error: float = 0.0) -> DarkCurrentLaws:
-    """Return the Arrhenius law and the doubling temperature of EMVA 1288 through dark currents `found`: (deg C, e/s,
-    its standard deviation).
+def temperature_law(rates: Sequence[tuple[float, float, float]], gain_error: float = 0.0) -> DarkCurrentLaws:
+    """Fit the Arrhenius law and the doubling temperature of EMVA 1288 to dark currents.
 
         ln I = ln I_ref - E / k (1/T - 1/T_ref),    ln I = a + ln 2 (T - T_ref) / T_d
 
-    Weighted lines, T_ref the coldest temperature. Only currents above three standard deviations are used; two
-    temperatures are needed. `gain_error`: relative error of the gain, common to all.
+    Weighted lines, T_ref the coldest temperature.
+
+    rates : (temperature in deg C, dark current in e/s, its standard deviation) of each measurement; only currents above
+        three standard deviations are used, at two temperatures or more
+    gain_error : relative error of the gain, common to all
+
+    Returns the measurements alone where fewer than two temperatures have a significant current.
+
+    >>> law = temperature_law([(20.0, 10.0, 0.1), (27.0, 20.0, 0.1), (34.0, 40.0, 0.1)])
+    >>> round(law.doubling_temperature_c, 2)
+    7.0
     """
-    listed = np.array(found, float)
+    listed = np.array(rates, float)
     plain = DarkCurrentLaws(
         temperature_c=tuple(listed[:, 0]),
         dark_current_e_per_s=tuple(listed[:, 1]),
@@ -144,8 +152,8 @@ def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
 
 
 def black_level(e: Evaluation) -> tuple[float | None, float | None]:
-    """Black level, DN, and its standard deviation: the dark line at no exposure. The standard deviation includes the
-    fixed pattern as a sample of the camera.
+    """Return the black level, DN, and its standard deviation: the dark line at no exposure. The standard deviation
+    includes the fixed pattern as a sample of the camera.
     """
     if not e.levels.darks:
         return None, None
@@ -178,7 +186,7 @@ def dark_signal_hidden(e: Evaluation) -> bool:
 
 
 def dark_current(e: Evaluation) -> tuple[float | None, float | None]:
-    """Dark current, e/s, and its standard deviation: slope of the dark mean against exposure over K."""
+    """Return the dark current, e/s, and its standard deviation: slope of the dark mean against exposure over K."""
     if not e.levels.darks:
         return None, None
     line = e.dark.lines[None]
@@ -191,8 +199,8 @@ def dark_current(e: Evaluation) -> tuple[float | None, float | None]:
 
 
 def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | None]:
-    """Dark current, e/s, and its standard deviation: slope of the dark variance against exposure over K^2, all planes
-    together.
+    """Return the dark current, e/s, and its standard deviation: slope of the dark variance against exposure over K^2,
+    all planes together.
 
     K is that of the flats: the photon transfer of the darks themselves contains the same slope.
     """
@@ -202,9 +210,9 @@ def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | Non
         return None, None
     rates, weights = [], []
     for name in e.levels.names:
-        own = [level.plane[name] for level in repeated]
-        variance = np.array([plane.temporal_variance for plane in own])
-        std = np.array([plane.temporal_variance_std for plane in own])
+        planes = [level.plane[name] for level in repeated]
+        variance = np.array([plane.temporal_variance for plane in planes])
+        std = np.array([plane.temporal_variance_std for plane in planes])
         # a charge that drifts changes the shot noise by the gain times its change
         std = np.hypot(std, e.transfer.gain * np.array([level.drift_std_dn for level in repeated]))
         if variance.min() < e.levels.hidden_dn2:
@@ -230,7 +238,8 @@ def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | Non
 
 
 def dark_temperature_c(e: Evaluation) -> float | None:
-    """Sensor temperature (deg C) at which the dark currents were measured; None where the darks don't state it.
+    """Return the sensor temperature (deg C) at which the dark currents were measured; None where the darks don't state
+    it.
 
     It is the mean over the darks, weighted by exposure: a dark moves the slope of signal against exposure the more, the
     longer it is."""
@@ -250,7 +259,7 @@ def remark_on_temperatures(e: Evaluation) -> None:
     dark_c = dark_temperature_c(e)
     if dark_c is None:
         return
-    found: list[tuple[float, float, float]] = []
+    changes: list[tuple[float, float, float]] = []
     for level in e.levels.flats:
         rise_c = 0.0 if level.temperature_c is None else level.temperature_c - dark_c
         for name, plane in level.plane.items():
@@ -261,9 +270,9 @@ def remark_on_temperatures(e: Evaluation) -> None:
             std_dn = math.hypot(0.0 if math.isnan(plane.mean_std) else plane.mean_std, e.light_scatter * signal_dn)
             change_dn = line.rate * level.exposure_s * (2.0 ** (rise_c / DOUBLING_C) - 1.0)
             if abs(change_dn) > 3.0 * std_dn and signal_dn > 0.0:
-                found.append((abs(change_dn) / signal_dn, change_dn, dark_c + rise_c))
-    if found:
-        share, change_dn, flat_c = max(found)
+                changes.append((abs(change_dn) / signal_dn, change_dn, dark_c + rise_c))
+    if changes:
+        share, change_dn, flat_c = max(changes)
         e.remarks.add(
             f"flats at {flat_c:.1f} °C have darks at {dark_c:.1f} °C subtracted: their own dark signal differs by "
             f"{change_dn:+.2g} DN, {100.0 * share:.2g} % of the signal, if it doubles every {DOUBLING_C:g} °C; "
@@ -272,20 +281,20 @@ def remark_on_temperatures(e: Evaluation) -> None:
 
 
 def dark_current_temperature(e: Evaluation) -> DarkCurrentLaws | None:
-    """Dark current at every temperature with darks of two exposures, and the laws through those significantly above
-    0.
+    """Return the dark current at every temperature with darks of two exposures, and the laws through those
+    significantly above 0.
     """
-    found: list[tuple[float, float, float]] = []
+    rates: list[tuple[float, float, float]] = []
     temperatures = {level.temperature_c for level in e.levels.all_darks if level.temperature_c is not None}
     for temperature in sorted(temperatures):
-        own = [level for level in e.levels.all_darks if level.temperature_c == temperature]
-        line = dark_line(np.array([level.exposure_s for level in own]), *mean_and_std(own, e.levels.names))
+        darks = [level for level in e.levels.all_darks if level.temperature_c == temperature]
+        line = dark_line(np.array([level.exposure_s for level in darks]), *mean_and_std(darks, e.levels.names))
         if line.rate is not None:
             std = float(np.sqrt(line.covariance[1, 1]))
-            found.append((temperature, line.rate / e.transfer.gain, std / e.transfer.gain))
-    if not found:
+            rates.append((temperature, line.rate / e.transfer.gain, std / e.transfer.gain))
+    if not rates:
         return None
-    laws = temperature_law(found, e.transfer.gain_std / e.transfer.gain)
+    laws = temperature_law(rates, e.transfer.gain_std / e.transfer.gain)
     columns = (laws.temperature_c, laws.dark_current_e_per_s, laws.dark_current_e_per_s_std)
     for temperature, current, std in zip(*columns, strict=True):
         own_value = ", the value given" if temperature == e.levels.temperature_c else ""

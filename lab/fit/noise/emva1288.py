@@ -16,7 +16,7 @@ import numpy as np
 from scipy import special
 
 from lab.formats.results import Emva1288, Emva1288Points
-from lab.formats.results.words import measured
+from lab.formats.results.words import format_value
 from lab.observables.codes.rounding import QUANTISATION_DN2
 from lab.observables.noise.frame_sums import BoolArray
 from lab.observables.noise.levels import MeasuredLevel
@@ -70,10 +70,10 @@ class Measured:
     value: float
     std: float
 
-    def over(self, other: Measured) -> Measured:
-        """Quotient of independent numbers."""
-        quotient = self.value / other.value
-        return Measured(quotient, math.hypot(self.std / other.value, quotient * other.std / other.value))
+    def over(self, divisor: Measured) -> Measured:
+        """Return the quotient of independent numbers."""
+        quotient = self.value / divisor.value
+        return Measured(quotient, math.hypot(self.std / divisor.value, quotient * divisor.std / divisor.value))
 
 
 class EmvaLevels:
@@ -82,10 +82,10 @@ class EmvaLevels:
     def __init__(self, given: EmvaInput) -> None:
         self.given = given
         self.flats = [level for level in given.flats if level.repeats > 1]
-        own = [level.plane[given.plane] for level in self.flats]
+        bright = [level.plane[given.plane] for level in self.flats]
         self.darks = [level for level in given.darks if level.repeats > 1]
         dark = [level.plane[given.plane] for level in self.darks]
-        self.step_dn = max((plane.step_dn for plane in (*own, *dark)), default=1.0)
+        self.step_dn = max((plane.step_dn for plane in (*bright, *dark)), default=1.0)
         self.dark_exposure = np.array([level.exposure_s for level in self.darks])
         self.dark_variance = np.array([plane.temporal_variance for plane in dark])
         drift_dn = np.array([level.drift_std_dn for level in self.darks])
@@ -98,10 +98,10 @@ class EmvaLevels:
         self.variance_line = dark_line(self.dark_exposure, self.dark_variance, np.maximum(self.dark_variance_std, 1e-9))
         self.exposure = np.array([level.exposure_s for level in self.flats])
         self.light = np.array([level.light for level in self.flats])
-        self.mean = np.array([plane.mean for plane in own])
-        self.variance = np.array([plane.temporal_variance for plane in own])
+        self.mean = np.array([plane.mean for plane in bright])
+        self.variance = np.array([plane.temporal_variance for plane in bright])
         self.variance_std = np.hypot(
-            np.array([plane.temporal_variance_std for plane in own]), given.variance_error * self.variance
+            np.array([plane.temporal_variance_std for plane in bright]), given.variance_error * self.variance
         )
         # The dark of the same exposure where there is one, else the line through all darks
         self.source = [self._taken(level.exposure_s) for level in self.flats]
@@ -109,7 +109,7 @@ class EmvaLevels:
         self.below_variance = self.below(self.dark_variance, self.variance_line)
         self.signal = self.mean - self.below_mean
         lamp_error = np.maximum(given.lamp_error, [level.light_std for level in self.flats])
-        self.light_mean_std = np.hypot([plane.mean_std for plane in own], lamp_error * self.signal)
+        self.light_mean_std = np.hypot([plane.mean_std for plane in bright], lamp_error * self.signal)
         self.signal_std = np.hypot(self.light_mean_std, self.below(self.dark_mean_std, None))
 
     def _taken(self, exposure_s: float) -> int | None:
@@ -119,8 +119,8 @@ class EmvaLevels:
         return nearest if abs(self.dark_exposure[nearest] - exposure_s) <= 1e-6 * exposure_s else None
 
     def below(self, stack_of: FloatArray, line: DarkLine | None) -> FloatArray:
-        """Dark value at the exposure of each level; where none was taken, that of the line, or (None) the smallest of
-        all.
+        """Return the dark value at the exposure of each level; where none was taken, that of the line, or (None) the
+        smallest of all.
         """
         return np.array(
             [
@@ -132,17 +132,19 @@ class EmvaLevels:
         )
 
     def signal_covariance(self) -> FloatArray:
-        """Covariance of the signals (levels, levels), DN^2: levels share the error of a dark that both are less."""
-        found = np.diag(self.light_mean_std**2)
+        """Return the covariance of the signals (levels, levels), DN^2: levels share the error of a dark that both are
+        less.
+        """
+        covariance = np.diag(self.light_mean_std**2)
         for number, std in enumerate(self.dark_mean_std):
             shared = np.array([source == number for source in self.source], float)
-            found += std**2 * np.outer(shared, shared)
+            covariance += std**2 * np.outer(shared, shared)
         line = np.array([source is None for source in self.source], float)
         gradient = line[:, None] * np.stack([np.ones_like(self.exposure), self.exposure], axis=1)
-        return found + gradient @ self.mean_line.covariance @ gradient.T
+        return covariance + gradient @ self.mean_line.covariance @ gradient.T
 
     def gain(self, used: BoolArray) -> Measured:
-        """System gain K: slope through the origin of the variance against the signal, over the levels `used`
+        """Return the system gain K: slope through the origin of the variance against the signal, over the levels `used`
         (levels,).
         """
         x = np.where(used, self.signal, 0.0)
@@ -163,8 +165,9 @@ class EmvaLevels:
 
 
 def mean_std(levels: Sequence[MeasuredLevel], name: str) -> FloatArray:
-    """Standard deviations of the means of a plane: temporal noise and rounding, increased where repeats differ by more
-    than by a drift."""
+    """Return the standard deviations of the means of a plane: temporal noise and rounding, increased where repeats
+    differ by more than by a drift.
+    """
     noise, excess, freedom = [], 0.0, 0
     planes = [level.plane[name] for level in levels]
     for level, plane in zip(levels, planes, strict=True):
@@ -181,8 +184,8 @@ def mean_std(levels: Sequence[MeasuredLevel], name: str) -> FloatArray:
 
 
 def mean_ratio(x: FloatArray, y: FloatArray, std: FloatArray, slope: Measured) -> float | None:
-    """Mean of y / x (levels,), where it or the single levels contradict the line y = `slope` x by more than the noise
-    `std` (levels,) of y; None where they don't.
+    """Return the mean of y / x (levels,), where it or the single levels contradict the line y = `slope` x by more than
+    the noise `std` (levels,) of y; None where they don't.
 
     It is the slope of the same line with equal relative weights: where y is proportional to x, both are the same.
     """
@@ -229,21 +232,21 @@ def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
             f"{missing} of {at.signal.size} levels have no dark of their exposure: a line through the darks stands "
             "for it"
         )
-    found: Figures = {}
+    figures: Figures = {}
     if given.in_photons:
-        found |= _responsivity(at, used, gain, remarks)
+        figures |= _responsivity(at, used, gain, remarks)
     dark, limit_e = _dark_noise(at, gain, remarks)
-    found |= dark
-    found |= _sensitivity(at, top, gain, found)
+    figures |= dark
+    figures |= _sensitivity(at, top, gain, figures)
     lines, deviation = _linearity(at, saturation, remarks)
-    found |= lines
-    found |= _dark_current(at, gain, remarks)
+    figures |= lines
+    figures |= _dark_current(at, gain, remarks)
     stacks = _stacks(given, at, saturation, remarks)
-    found |= _spatial(given.plane, stacks, gain)
-    found |= _evenness(given.plane, stacks, found, remarks)
-    values_of = {name: value.value for name, value in found.items()}
-    values_of |= {f"{name}_std": value.std for name, value in found.items()}
-    values_of |= _calibration(at, found, remarks)
+    figures |= _spatial(given.plane, stacks, gain)
+    figures |= _evenness(given.plane, stacks, figures, remarks)
+    values_of = {name: value.value for name, value in figures.items()}
+    values_of |= {f"{name}_std": value.std for name, value in figures.items()}
+    values_of |= _calibration(at, figures, remarks)
     return Emva1288(
         **values_of,
         system_gain_dn_per_e=gain.value,
@@ -255,11 +258,11 @@ def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
     )
 
 
-def _calibration(at: EmvaLevels, found: Figures, remarks: list[str]) -> dict[str, float]:
+def _calibration(at: EmvaLevels, figures: Figures, remarks: list[str]) -> dict[str, float]:
     """Return what the calibration of the reference that measured the light adds: a factor common to all numbers of
     photons."""
     relative = max((level.light_calibration_std for level in at.flats), default=0.0)
-    if not relative or "quantum_efficiency" not in found:
+    if not relative or "quantum_efficiency" not in figures:
         return {}
     remarks.append(
         f"the photodiode's calibration has a standard uncertainty of {100.0 * relative:.2g} %: it is a factor common "
@@ -268,7 +271,7 @@ def _calibration(at: EmvaLevels, found: Figures, remarks: list[str]) -> dict[str
     )
     return {
         "photons_systematic_std_percent": 100.0 * relative,
-        "quantum_efficiency_systematic_std": relative * found["quantum_efficiency"].value,
+        "quantum_efficiency_systematic_std": relative * figures["quantum_efficiency"].value,
     }
 
 
@@ -358,14 +361,14 @@ def _dark_noise(at: EmvaLevels, gain: Measured, remarks: list[str]) -> tuple[Fig
     }, None
 
 
-def _sensitivity(at: EmvaLevels, top: int | None, gain: Measured, found: Figures) -> Figures:
+def _sensitivity(at: EmvaLevels, top: int | None, gain: Measured, figures: Figures) -> Figures:
     """Threshold, saturation capacity, largest SNR and dynamic range; in photons where the quantum efficiency is
     known.
     """
     given: Figures = {}
-    responsivity = found.get("responsivity_dn_per_photon")
-    efficiency = found.get("quantum_efficiency")
-    dark = found.get("temporal_dark_noise_dn")
+    responsivity = figures.get("responsivity_dn_per_photon")
+    efficiency = figures.get("quantum_efficiency")
+    dark = figures.get("temporal_dark_noise_dn")
     if dark is not None:
         dark_e = dark.over(gain)
         inner = math.sqrt(dark_e.value**2 + 0.25)
@@ -421,19 +424,19 @@ def _dark_current(at: EmvaLevels, gain: Measured, remarks: list[str]) -> Figures
     if np.unique(at.dark_exposure).size < 3:
         remarks.append("darks of fewer than three exposures: no dark current")
         return {}
-    found: Figures = {}
+    figures: Figures = {}
     mean, variance = at.mean_line, at.variance_line
     hidden = float(at.dark_variance.min()) < HIDDEN_DN2 * at.step_dn**2
     if hidden and mean.rate is not None and abs(mean.rate) < 3.0 * math.sqrt(float(mean.covariance[1, 1])):
         remarks.append("rounding hides the dark current, which the means of the darks don't show")
     elif mean.rate is not None:
         rate = Measured(mean.rate, math.sqrt(float(mean.covariance[1, 1])))
-        found["dark_current_from_mean_e_per_s"] = rate.over(gain)
+        figures["dark_current_from_mean_e_per_s"] = rate.over(gain)
     if variance.rate is not None and not hidden:
         rate = Measured(variance.rate, math.sqrt(float(variance.covariance[1, 1])))
         square = Measured(gain.value**2, 2.0 * gain.value * gain.std)
-        found["dark_current_from_variance_e_per_s"] = rate.over(square)
-    return found
+        figures["dark_current_from_variance_e_per_s"] = rate.over(square)
+    return figures
 
 
 @dataclass(frozen=True)
@@ -474,28 +477,28 @@ def _stacks(given: EmvaInput, at: EmvaLevels, saturation: float, remarks: list[s
 
 
 def _spatial(plane: str, stacks: _Stacks, gain: Measured) -> Figures:
-    found: Figures = {}
+    figures: Figures = {}
     dark = stacks.dark.plane[plane].every_pixel if stacks.dark is not None else None
     if dark is None:
-        return found
+        return figures
     for name, square in _parts(dark).items():
-        found[f"dsnu{name}_e"] = Measured(*root(square.value, square.std)).over(gain)
+        figures[f"dsnu{name}_e"] = Measured(*root(square.value, square.std)).over(gain)
     bright = stacks.bright.plane[plane].every_pixel if stacks.bright is not None else None
     if bright is None or stacks.bright is None or stacks.dark is None:
-        return found
+        return figures
     signal = stacks.bright.plane[plane].mean_of_all - stacks.dark.plane[plane].mean_of_all
     below = _parts(dark)
     for name, square in _parts(bright).items():
         # Both stacks contain the same dark pattern: only the uncertainty of its measurement counts
         root_dn = Measured(*root(square.value - below[name].value, math.hypot(square.std, below[name].std)))
-        found[f"prnu{name}_percent"] = Measured(100.0 * root_dn.value / signal, 100.0 * root_dn.std / signal)
-    return found
+        figures[f"prnu{name}_percent"] = Measured(100.0 * root_dn.value / signal, 100.0 * root_dn.std / signal)
+    return figures
 
 
-def _evenness(plane: str, stacks: _Stacks, found: Figures, remarks: list[str]) -> Figures:
+def _evenness(plane: str, stacks: _Stacks, figures: Figures, remarks: list[str]) -> Figures:
     """Split the nonuniformity of the bright stack into the smooth surface and what rows and columns share without it,
     and report light that is more uneven than the standard asks for, and gains of rows and columns."""
-    if stacks.bright is None or stacks.dark is None or "prnu_percent" not in found:
+    if stacks.bright is None or stacks.dark is None or "prnu_percent" not in figures:
         return {}
     bright, dark = stacks.bright.plane[plane], stacks.dark.plane[plane]
     if bright.pattern is None or dark.pattern is None or bright.every_pixel is None:
@@ -509,20 +512,21 @@ def _evenness(plane: str, stacks: _Stacks, found: Figures, remarks: list[str]) -
     if uneven.value - SIGNIFICANT_SIGMA * uneven.std > LARGEST_NONUNIFORMITY_PERCENT:
         rest = _without_dark(bright.pattern.total, dark.pattern.total)
         remarks.append(
-            f"the light is uneven by {measured(uneven.value, uneven.std, '%')} (highest less lowest over the mean), "
-            f"above the standard's limit of {LARGEST_NONUNIFORMITY_PERCENT:g} %: PRNU1288 of "
-            f"{found['prnu_percent'].value:.3g} % is {shading.value:.3g} % of shading and {100.0 * rest / signal:.4g} "
-            "% without it; light the sensor evenly, without a lens"
+            f"the light is uneven by {format_value(uneven.value, uneven.std, '%')} (highest less lowest over the "
+            f"mean), above the standard's limit of {LARGEST_NONUNIFORMITY_PERCENT:g} %: PRNU1288 of "
+            f"{figures['prnu_percent'].value:.3g} % is {shading.value:.3g} % of shading and "
+            f"{100.0 * rest / signal:.4g} % without it; light the sensor evenly, without a lens"
         )
     for line in ("row", "column"):
-        own, below = getattr(bright.pattern, f"{line}s"), getattr(dark.pattern, f"{line}s")
+        bright_variance, dark_variance = getattr(bright.pattern, f"{line}s"), getattr(dark.pattern, f"{line}s")
         std = math.hypot(getattr(bright.pattern, f"{line}s_std"), getattr(dark.pattern, f"{line}s_std"))
-        gains = Measured(*(100.0 * part / signal for part in root(own - below, std)))
+        gains = Measured(*(100.0 * part / signal for part in root(bright_variance - dark_variance, std)))
         more[f"{line}_gain_percent"] = gains
-        if own - below > LINE_SIGMA * std:
+        if bright_variance - dark_variance > LINE_SIGMA * std:
             remarks.append(
-                f"the gains of {line}s differ by {measured(gains.value, gains.std, '%')} (standard deviation, shading "
-                f"removed), {(own - below) / std:.0f} standard deviations above what independent pixels give: "
+                f"the gains of {line}s differ by {format_value(gains.value, gains.std, '%')} (standard deviation, "
+                f"shading removed), {(bright_variance - dark_variance) / std:.0f} standard deviations above what "
+                "independent pixels give: "
                 f"amplifiers or converters of the {line}s; correct each {line} by its own flat field"
             )
     return more

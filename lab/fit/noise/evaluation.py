@@ -120,7 +120,8 @@ def transfer_of(
     darks: Sequence[MeasuredLevel],
     series: Sequence[MeasuredLevel],
 ) -> tuple[TransferFit, list[tuple[MeasuredLevel, str]]]:
-    """Photon transfer of `darks` and the unsaturated flats with repeats of the `series`, and its points (level, plane).
+    """Fit the photon transfer of `darks` and the unsaturated flats with repeats of the `series`, and its points (level,
+    plane).
 
     Raises `NotDetermined` where fewer than three unsaturated flat levels have repeats, or where the variance doesn't
     grow with the signal.
@@ -130,15 +131,17 @@ def transfer_of(
     for level in (*darks, *series):
         bright = level.lamp != "dark"
         for index, name in enumerate(recorded.names):
-            own = level.plane[name]
-            if own.repeats < 2 or own.temporal_variance <= 0:
+            measured = level.plane[name]
+            if measured.repeats < 2 or measured.temporal_variance <= 0:
                 continue
-            if bright and (saturation.clipped[name][recorded.flats.index(level)] or own.zero_share > CLIPPED_LIMIT):
+            if bright and (
+                saturation.clipped[name][recorded.flats.index(level)] or measured.zero_share > CLIPPED_LIMIT
+            ):
                 continue
             points.append((level, name))
-            x.append(own.mean - dark.lines[name].black)
+            x.append(measured.mean - dark.lines[name].black)
             v.append(recorded.pixel_variance_dn2(level, name))
-            s.append(own.temporal_variance_std)
+            s.append(measured.temporal_variance_std)
             plane.append(index)
             light.append(bright)
     bright_levels = {level.light for level, _ in points if level.lamp != "dark"}

@@ -30,20 +30,20 @@ class LampDrift:
 
 
 def lamp_drift(recorded: RecordedLevels, dark: DarkSignal, saturation: Saturation) -> LampDrift:
-    """Differences of the means of repeated flats, over all unsaturated levels and planes."""
+    """Compare the means of repeated flats, over all unsaturated levels and planes."""
     relative, square, expected, chi2, freedom = 0.0, 0.0, 0.0, 0.0, 0
     for level in recorded.flats:
-        own = [n for n in recorded.names if not saturation.clipped[n][recorded.flats.index(level)]]
-        if level.repeats < 2 or not own:
+        unclipped = [n for n in recorded.names if not saturation.clipped[n][recorded.flats.index(level)]]
+        if level.repeats < 2 or not unclipped:
             continue
-        planes = [level.plane[n] for n in own]
+        planes = [level.plane[n] for n in unclipped]
         pixels = np.array([plane.pixels for plane in planes], float)
         frames = np.average([plane.frame_means for plane in planes], axis=0, weights=pixels)
         variance = float(np.average([plane.temporal_variance for plane in planes], weights=pixels))
         rounding = max(plane.mean_rounding_std for plane in planes)
         noise = max(variance, recorded.quantisation_dn2) / pixels.sum() + rounding**2
         signal = float(
-            np.average([p.mean - dark.lines[n].black for p, n in zip(planes, own, strict=True)], weights=pixels)
+            np.average([p.mean - dark.lines[n].black for p, n in zip(planes, unclipped, strict=True)], weights=pixels)
         )
         rest = float(np.sum((frames - frames.mean()) ** 2))
         square += rest

@@ -68,7 +68,7 @@ ASYMMETRY = 0.002  # difference of the light on opposite edges, of the mean, abo
 
 
 def dsnu(e: Evaluation) -> tuple[float | None, float | None]:
-    """DSNU, e, and its standard deviation: the spatial standard deviation of the dark pattern over K."""
+    """Return DSNU, e, and its standard deviation: the spatial standard deviation of the dark pattern over K."""
     pattern = dark_pattern(e)
     if pattern is None or dark_signal_hidden(e):
         return None, None
@@ -79,7 +79,7 @@ def dsnu(e: Evaluation) -> tuple[float | None, float | None]:
 
 
 def prnu(e: Evaluation) -> tuple[float | None, float | None]:
-    """PRNU, %, and its standard deviation: sqrt(pattern variance - dark pattern variance) / signal, of the flat
+    """Return PRNU, %, and its standard deviation: sqrt(pattern variance - dark pattern variance) / signal, of the flat
     nearest to half of saturation, mean over the planes.
     """
     dark = dark_pattern(e)
@@ -126,11 +126,11 @@ def dark_pattern(e: Evaluation) -> tuple[MeasuredLevel, float, float] | None:
     if not repeated:
         return None
     level = max(repeated, key=lambda level: (level.repeats, -level.exposure_s))
-    own = [level.plane[name] for name in e.levels.names]
-    pixels = np.array([plane.pixels for plane in own], float)
+    planes = [level.plane[name] for name in e.levels.names]
+    pixels = np.array([plane.pixels for plane in planes], float)
     pixels /= pixels.sum()
-    value = float(pixels @ [plane.spatial_variance for plane in own])
-    return level, value, float(np.sqrt(np.sum((pixels * [plane.spatial_variance_std for plane in own]) ** 2)))
+    value = float(pixels @ [plane.spatial_variance for plane in planes])
+    return level, value, float(np.sqrt(np.sum((pixels * [plane.spatial_variance_std for plane in planes]) ** 2)))
 
 
 def remark_on_shading(e: Evaluation) -> None:
@@ -146,13 +146,13 @@ def remark_on_shading(e: Evaluation) -> None:
     if not edges:
         return
     first_row, last_row, first_col, last_col = np.mean(edges, axis=0)
-    found = [
+    slopes = [
         f"{axis} from {first:.3f} in their first tenth to {last:.3f} in their last"
         for axis, first, last in (("rows", first_row, last_row), ("columns", first_col, last_col))
         if abs(last - first) > ASYMMETRY
     ]
-    if found:
-        e.remarks.add(f"the flats' shading is asymmetric: {'; '.join(found)}, of the mean")
+    if slopes:
+        e.remarks.add(f"the flats' shading is asymmetric: {'; '.join(slopes)}, of the mean")
 
 
 # The noise fit of one camera: all figures, by channel too, with the points of its plots.
@@ -212,7 +212,7 @@ def _result(e: Evaluation, pixels: PixelFigures | None) -> NoiseFit:
 def principal_figures(e: Evaluation) -> dict[str, float | None]:
     """Return the figures that stand for the sensor and for each channel, with their standard deviations."""
     scale = 10.0 ** (-e.levels.gain_db / 20.0)
-    found: dict[str, tuple[float | None, float | None]] = {
+    figures: dict[str, tuple[float | None, float | None]] = {
         "conversion_gain_dn_per_e": (e.transfer.gain * scale, e.transfer.gain_std * scale),
         "read_noise_e": read_noise(e),
         "black_level_dn": black_level(e),
@@ -222,33 +222,35 @@ def principal_figures(e: Evaluation) -> dict[str, float | None]:
         "full_well_e": full_well(e),
         "linearity_error_percent": linearity_error(e),
     }
-    values = {name: value for name, (value, _) in found.items()}
-    return values | {f"{name}_std": std for name, (_, std) in found.items()}
+    values = {name: value for name, (value, _) in figures.items()}
+    return values | {f"{name}_std": std for name, (_, std) in figures.items()}
 
 
 def channel_figures(e: Evaluation, principal: dict[str, float | None]) -> dict[str, ChannelNoise]:
-    """Figures of each colour by itself; a channel that its levels don't determine is left out and reported."""
-    found: dict[str, ChannelNoise] = {}
+    """Return the figures of each colour by itself; a channel that its levels don't determine is reported instead."""
+    noise_of_channel: dict[str, ChannelNoise] = {}
     for channel in dict.fromkeys(name[0] for name in e.levels.names):
-        own = tuple(name for name in e.levels.names if name[0] == channel)
+        planes_of_channel = tuple(name for name in e.levels.names if name[0] == channel)
         try:
             part = (
                 principal
-                if own == e.levels.names
+                if planes_of_channel == e.levels.names
                 else principal_figures(
-                    evaluate(e.levels.all_darks, e.levels.flats, e.levels.camera, e.levels.gain_db, 0, own)
+                    evaluate(
+                        e.levels.all_darks, e.levels.flats, e.levels.camera, e.levels.gain_db, 0, planes_of_channel
+                    )
                 )
             )
         except NotDetermined as refused:
             e.remarks.add(f"channel {channel} alone: {refused.reason}")
             continue
-        found[channel] = ChannelNoise(**part)
-    return found
+        noise_of_channel[channel] = ChannelNoise(**part)
+    return noise_of_channel
 
 
 def emva1288_by_plane(e: Evaluation) -> dict[str, Emva1288]:
     """Compute the figures as specified in EMVA 1288, by plane; what a plane lacks is reported."""
-    found: dict[str, Emva1288] = {}
+    figures_of_plane: dict[str, Emva1288] = {}
     main = sorted(main_lamp_levels(e), key=lambda level: level.light)
     lamp = main[0].lamp
     photons = isinstance(lamp, tuple) and len(lamp) == 3 and bool(lamp[1])
@@ -265,43 +267,43 @@ def emva1288_by_plane(e: Evaluation) -> dict[str, Emva1288]:
             spatial=tuple(level for level in e.levels.flats if level.lamp == lamp and level.light > 0),
             gain_dn_per_e=e.transfer.gain,
         )
-        own = emva1288_figures(given)
-        if isinstance(own, str):
-            e.remarks.add(f"no EMVA 1288 figures: {own}")
+        figures = emva1288_figures(given)
+        if isinstance(figures, str):
+            e.remarks.add(f"no EMVA 1288 figures: {figures}")
         else:
-            found[name] = own
-    return found
+            figures_of_plane[name] = figures
+    return figures_of_plane
 
 
 def photon_transfer_points(e: Evaluation, deviation: dict[tuple[int, str], float]) -> PhotonTransfer:
-    """Points of the plot: flats by channel, means over the planes of the channel."""
+    """Return the points of the plot: flats by channel, means over the planes of the channel."""
     used = {(id(level), name): bool(flag) for (level, name), flag in zip(e.points, e.transfer.used, strict=True)}
     rows: list[tuple[str, float, float, float, float, float, bool, float | None]] = []
     channels = dict.fromkeys(name[0] for name in e.levels.names)
     for level in e.levels.flats:
         for channel in channels:
-            own = [name for name in e.levels.names if name[0] == channel and level.repeats > 1]
-            if not own:
+            names = [name for name in e.levels.names if name[0] == channel and level.repeats > 1]
+            if not names:
                 continue
-            planes = [level.plane[name] for name in own]
-            signal = [p.mean - e.dark.mean_dn(n, level.exposure_s) for p, n in zip(planes, own, strict=True)]
-            index = [e.plane_index.get(n) for n in own]
+            planes = [level.plane[name] for name in names]
+            signal = [p.mean - e.dark.mean_dn(n, level.exposure_s) for p, n in zip(planes, names, strict=True)]
+            index = [e.plane_index.get(n) for n in names]
             floor = [0.0 if i is None else float(e.transfer.floor[i]) for i in index]
             dark = [
                 f + e.transfer.gain * (e.dark.mean_dn(n, level.exposure_s) - e.dark.lines[n].black)
-                for f, n in zip(floor, own, strict=True)
+                for f, n in zip(floor, names, strict=True)
             ]
-            variance = [e.levels.pixel_variance_dn2(level, n) - d for n, d in zip(own, dark, strict=True)]
-            shares = [deviation[id(level), n] for n in own if (id(level), n) in deviation]
+            variance = [e.levels.pixel_variance_dn2(level, n) - d for n, d in zip(names, dark, strict=True)]
+            shares = [deviation[id(level), n] for n in names if (id(level), n) in deviation]
             rows.append(
                 (
                     channel,
                     level.exposure_s,
                     float(np.mean(signal)),
-                    float(np.sqrt(np.sum([p.mean_std**2 for p in planes])) / len(own)),
+                    float(np.sqrt(np.sum([p.mean_std**2 for p in planes])) / len(names)),
                     float(np.mean(variance)),
-                    float(np.sqrt(np.sum([p.temporal_variance_std**2 for p in planes])) / len(own)),
-                    all(used.get((id(level), n), False) for n in own),
+                    float(np.sqrt(np.sum([p.temporal_variance_std**2 for p in planes])) / len(names)),
+                    all(used.get((id(level), n), False) for n in names),
                     float(np.mean(shares)) if shares else None,
                 )
             )
@@ -329,18 +331,20 @@ def remark_on_planes(e: Evaluation) -> None:
     """Report planes that differ in conversion gain, as read-out channels of their own do."""
     values, weights = [], []
     for name in e.levels.names:
-        own = [
+        used_flats = [
             (level.plane[name], level)
             for (level, plane), used in zip(e.points, e.transfer.used, strict=True)
             if plane == name and used and level.lamp != "dark"
         ]
-        if not own or e.transfer.by_line:
+        if not used_flats or e.transfer.by_line:
             continue
-        signal = np.array([p.mean - e.dark.lines[name].black for p, _ in own])
-        variance = np.array([e.levels.pixel_variance_dn2(level, name) for _, level in own])
+        signal = np.array([p.mean - e.dark.lines[name].black for p, _ in used_flats])
+        variance = np.array([e.levels.pixel_variance_dn2(level, name) for _, level in used_flats])
         excess = variance - e.transfer.floor[e.plane_index[name]]
         excess -= e.transfer.curvature * signal**2
-        weight = (signal / np.hypot([p.temporal_variance_std for p, _ in own], e.transfer.model_error * excess)) ** 2
+        weight = (
+            signal / np.hypot([p.temporal_variance_std for p, _ in used_flats], e.transfer.model_error * excess)
+        ) ** 2
         values.append(float(np.sum(weight * excess / signal) / weight.sum()))
         weights.append(float(weight.sum()))
     if len(values) < 2:
@@ -358,7 +362,7 @@ MIN_SIZE_PX = 16
 
 
 def fit_noise(recordings: RecordingSet, side: Side, drifts: Sequence[RepeatDrift] | None = None) -> NoiseFit:
-    """Photon transfer of one camera from its darks and flats (two repeats or more per level).
+    """Fit the photon transfer of one camera to its darks and flats (two repeats or more per level).
 
     Flats and darks of the most frequent `gain_db` are used; the conversion gain is given for 0 dB. `drifts`: of the
     side's repeats over time, None: they are looked for. No more than one level is held in memory. Raises
@@ -408,7 +412,11 @@ def fit_noise(recordings: RecordingSet, side: Side, drifts: Sequence[RepeatDrift
         for group in grouped(flats, lambda flat: (flat.exposure_s, light[flat.id].amount, lamps[flat.id]))
     ]
     alike = alike_planes(recordings, side)
-    mishaps = (*other_gains, *copies.told, *(one.told(side) for one in (exchanged, alike) if one is not None))
+    mishaps = (
+        *other_gains,
+        *copies.told,
+        *(finding.told(side) for finding in (exchanged, alike) if finding is not None),
+    )
     try:
         fitted = noise_fit(measured.levels, flat_levels, camera, gain_db, pixels=measured.pixels)
     except NotDetermined as refused:
@@ -464,7 +472,7 @@ Setting = tuple[str, float, float | None, float | None, float | None]
 
 
 def fit_level_table(file: Path, camera: DataSheet) -> FitResult:
-    """Photon transfer from the table `file`, of a camera whose `cfa`, `bit_depth` and levels `camera` states.
+    """Fit the photon transfer to the table `file`, of a camera whose `cfa`, `bit_depth` and levels `camera` states.
 
     Raises InputError with one line where a column is missing or unknown (another unit, above all) or a cell is no
     number, and `NotDetermined` where the levels don't determine the conversion gain.

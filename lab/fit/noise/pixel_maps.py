@@ -46,7 +46,7 @@ class PixelMaps:
 
 
 def pixel_maps(recordings: RecordingSet, side: Side) -> PixelMaps:
-    """Maps of offset, dark current and relative gain of the pixels of `side`.
+    """Return maps of offset, dark current and relative gain of the pixels of `side`.
 
     Offset and dark current: a weighted line through the dark means of each pixel against exposure, of the darks of the
     temperature at which most flats, or else most darks, were taken. Gain: the weighted
@@ -54,8 +54,8 @@ def pixel_maps(recordings: RecordingSet, side: Side) -> PixelMaps:
     """
     camera = recordings.camera(side)
     flats = recordings.captures(FlatCapture, side)
-    own = darks_near(recordings.captures(DarkCapture, side), flats)
-    darks = sorted(_levels(own), key=lambda group: -group[0].exposure_s)
+    darks_at_temperature = darks_near(recordings.captures(DarkCapture, side), flats)
+    darks = sorted(_levels(darks_at_temperature), key=lambda group: -group[0].exposure_s)
     if not darks:
         raise NotDetermined("noise", "no darks: capture two or more at each of two exposures for maps of single pixels")
     step_dn = find_code_step(recordings, side).step_dn
@@ -122,12 +122,12 @@ def _dark_maps(
     defective = defective_pixels(means[0], cfa, step_dn)
     t, w = np.array(exposure), np.array(weight)
     middle = float(np.sum(w * t) / w.sum())
-    mean = sum(one * share for one, share in zip(means, w / w.sum(), strict=True))
+    mean = sum(dark_mean * share for dark_mean, share in zip(means, w / w.sum(), strict=True))
     shape = means[0].shape
     norm = float(np.sum(w * (t - middle) ** 2))
     if norm <= 1e-12 * w.sum() * max(middle, 1e-12) ** 2:
         return (np.asarray(mean, float), np.full(shape, w.sum() ** -0.5)), None, defective
-    slope = sum(one * share for one, share in zip(means, w * (t - middle) / norm, strict=True))
+    slope = sum(dark_mean * share for dark_mean, share in zip(means, w * (t - middle) / norm, strict=True))
     offset = np.asarray(mean - slope * middle, float)
     offset_std = float(np.sqrt(1.0 / w.sum() + middle**2 / norm))
     return (

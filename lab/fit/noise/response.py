@@ -19,25 +19,25 @@ LINEARITY_RANGE = (0.05, 0.95)  # of saturation: range of the linearity line of 
 
 
 def linearity_by_plane(e: Evaluation) -> tuple[dict[str, Linearity], dict[tuple[int, str], float]]:
-    """Linearity by plane, and the deviation, %, of every (id of level, plane) that has one."""
-    found: dict[str, Linearity] = {}
+    """Return the linearity by plane, and the deviation, %, of every (id of level, plane) that has one."""
+    lines: dict[str, Linearity] = {}
     deviation: dict[tuple[int, str], float] = {}
     for name in e.levels.names:
         chosen = levels_in_range(e, name, *LINEARITY_RANGE)
         if len({level.light for level in chosen}) < 4:
             continue
-        found[name] = _line(e, name, chosen)
-        for level, percent in zip(chosen, found[name].deviation_percent, strict=True):
+        lines[name] = _line(e, name, chosen)
+        for level, percent in zip(chosen, lines[name].deviation_percent, strict=True):
             deviation[id(level), name] = float(percent)
-    if not found:
+    if not lines:
         e.remarks.add(
             "fewer than four levels of one lamp between 5 and 95 % of saturation: the linearity error isn't determined"
         )
-    return found, deviation
+    return lines, deviation
 
 
 def linearity_error(e: Evaluation) -> tuple[float | None, float | None]:
-    """Mean of the planes' linearity errors, %, and its standard deviation.
+    """Return the mean of the planes' linearity errors, %, and its standard deviation.
 
     Planes see the same lamp: where it drifts, their errors are fully correlated. So is always what noise adds to a
     modulus.
@@ -52,14 +52,14 @@ def linearity_error(e: Evaluation) -> tuple[float | None, float | None]:
 
 
 def main_lamp_levels(e: Evaluation) -> list[MeasuredLevel]:
-    """Flats of the series of the lamp with most levels."""
+    """Return the flats of the series of the lamp with most levels."""
     lamps = [level.lamp for level in e.consistency.series]
     lamp = max(dict.fromkeys(lamps), key=lamps.count)
     return [level for level in e.consistency.series if level.lamp == lamp]
 
 
 def levels_in_range(e: Evaluation, name: str, low: float, high: float) -> list[MeasuredLevel]:
-    """Unsaturated flats of the main lamp with a signal of `low` to `high` of saturation."""
+    """Return the unsaturated flats of the main lamp with a signal of `low` to `high` of saturation."""
     clipped = dict(zip(map(id, e.levels.flats), e.saturation.clipped[name], strict=True))
     return [
         level
@@ -74,8 +74,8 @@ def levels_in_range(e: Evaluation, name: str, low: float, high: float) -> list[M
 def response_to_light(
     e: Evaluation, name: str, levels: Sequence[MeasuredLevel]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Light, signal (DN above dark) and its standard deviation, (levels,) each: by noise, and by what the levels
-    scatter beyond it; that of the darks isn't in it.
+    """Return the light, signal (DN above dark) and its standard deviation, (levels,) each: by noise, and by what the
+    levels scatter beyond it; that of the darks isn't in it.
     """
     signal = np.array([level.plane[name].mean - e.dark.mean_dn(name, level.exposure_s) for level in levels])
     noise = np.array([level.plane[name].mean_std for level in levels])
@@ -92,7 +92,7 @@ def _line(e: Evaluation, name: str, levels: Sequence[MeasuredLevel]) -> Linearit
 
 
 def full_well(e: Evaluation) -> tuple[float | None, float | None]:
-    """Saturation, e, and its standard deviation; None where no flat saturates."""
+    """Return the saturation, e, and its standard deviation; None where no flat saturates."""
     seen = [(value, name) for name, value in e.saturation.seen_dn.items() if value is not None]
     if not seen:
         highest = max(
@@ -115,8 +115,8 @@ def full_well(e: Evaluation) -> tuple[float | None, float | None]:
 
 
 def quantum_efficiency(e: Evaluation) -> dict[str, float | None]:
-    """Quantum efficiency of a MONO camera, its standard deviations and wavelength (nm), by EMVA 1288: responsivity over
-    K.
+    """Return the quantum efficiency of a MONO camera, its standard deviations and wavelength (nm), by EMVA 1288:
+    responsivity over K.
 
     The responsivity is the slope of the signal against photons, to 70 % of saturation. Empty without a number of
     photons.
@@ -187,31 +187,31 @@ ADJACENT = {"Y": ("Y",), "R": ("G1", "G2"), "B": ("G1", "G2"), "G1": ("R", "B"),
 
 
 def variance_curvature_figures(e: Evaluation) -> dict[str, float]:
-    """Percent at saturation, with standard deviations: curvature of the response, of the variance, what the variance
-    lacks beyond three times that of the response, and the covariance of neighbours. Reports what bends the variance.
-    Empty where no level is near saturation (`LEAST_REACH`).
+    """Return, in per cent at saturation with standard deviations, the curvature of the response, of the variance, what
+    the variance lacks beyond three times that of the response, and the covariance of neighbours. Reports what bends the
+    variance. Empty where no level is near saturation (`LEAST_REACH`).
     """
     t = e.transfer
     if not e.reaches_saturation:
         return {}
-    found = {
+    figures = {
         "variance_bend_percent": 100.0 * t.relative_curvature,
         "variance_bend_percent_std": 100.0 * t.relative_curvature_std,
     }
     shared = neighbour_covariance(e)
     if shared is not None:
-        found["neighbour_covariance_percent"] = 100.0 * shared[0]
-        found["neighbour_covariance_percent_std"] = 100.0 * shared[1]
+        figures["neighbour_covariance_percent"] = 100.0 * shared[0]
+        figures["neighbour_covariance_percent_std"] = 100.0 * shared[1]
     response = response_curvature(e)
     if response is None:
-        return found
-    found["response_bend_percent"], found["response_bend_percent_std"] = 100.0 * response[0], 100.0 * response[1]
+        return figures
+    figures["response_bend_percent"], figures["response_bend_percent_std"] = 100.0 * response[0], 100.0 * response[1]
     # v = K (dy/de)^2 e: a response of curvature b at saturation gives the variance a curvature of 3 b
     missing = 3.0 * response[0] - t.relative_curvature
     missing_std = float(np.hypot(3.0 * response[1], t.relative_curvature_std))
     if missing_std > LARGEST_BEND_STD:
-        return found
-    found["brighter_fatter_percent"], found["brighter_fatter_percent_std"] = 100.0 * missing, 100.0 * missing_std
+        return figures
+    figures["brighter_fatter_percent"], figures["brighter_fatter_percent_std"] = 100.0 * missing, 100.0 * missing_std
     causes = []
     if abs(response[0]) > 4.0 * response[1] and abs(3.0 * response[0]) > 2.0 * missing_std:
         causes.append(f"a response that bends by {100 * response[0]:+.2g} +- {100 * response[1]:.1g} %")
@@ -226,12 +226,12 @@ def variance_curvature_figures(e: Evaluation) -> dict[str, float]:
         )
     if causes and abs(t.relative_curvature) > 2.0 * t.relative_curvature_std:
         e.remarks.add(f"at saturation, the variance bends by {' and '.join(causes)}")
-    return found
+    return figures
 
 
 def response_curvature(e: Evaluation) -> tuple[float, float] | None:
-    """Departure of the response from its slope at zero, relative, at saturation: from means against light, all planes
-    together.
+    """Return the departure of the response from its slope at zero, relative, at saturation: from means against light,
+    all planes together.
 
     x = o + S l + q l^2, with an offset for light that the clock of the exposure doesn't count; the result is q x_sat /
     S^2. None, and a remark, where the means don't follow this law.
@@ -293,8 +293,8 @@ def _rms(values: FloatArray) -> float:
 
 
 def neighbour_covariance(e: Evaluation) -> tuple[float, float] | None:
-    """Temporal covariance of a pixel with its eight neighbours as a share of the variance of its shot noise, at
-    saturation.
+    """Return the temporal covariance of a pixel with its eight neighbours as a share of the variance of its shot noise,
+    at saturation.
 
     4 (adjacent + diagonal) less that of the darks = share K x x_beside / x_sat, x_beside the mean of the planes that
     it adjoins.
@@ -303,10 +303,10 @@ def neighbour_covariance(e: Evaluation) -> tuple[float, float] | None:
     rows: list[tuple[float, float, float]] = []
     dark: dict[str, tuple[float, float]] = {}
     for name in e.levels.names:
-        own = [level.plane[name] for level in e.levels.darks if np.isfinite(level.plane[name].covariance_std)]
-        if own:
-            weight = np.array([1.0 / max(plane.covariance_std, 1e-9) ** 2 for plane in own])
-            both = np.array([4.0 * (plane.adjacent_covariance + plane.diagonal_covariance) for plane in own])
+        dark_planes = [level.plane[name] for level in e.levels.darks if np.isfinite(level.plane[name].covariance_std)]
+        if dark_planes:
+            weight = np.array([1.0 / max(plane.covariance_std, 1e-9) ** 2 for plane in dark_planes])
+            both = np.array([4.0 * (plane.adjacent_covariance + plane.diagonal_covariance) for plane in dark_planes])
             dark[name] = float(np.average(both, weights=weight)), float(np.sqrt(32.0 / weight.sum()))
     for level, name in e.points:
         plane = level.plane[name]

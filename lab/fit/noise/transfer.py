@@ -66,11 +66,22 @@ def fit_transfer(
     light: NDArray[np.bool_],
     saturation: float,
 ) -> TransferFit:
-    """Conversion gain, curvature and dark variances from points (n,) of all planes.
+    """Fit conversion gain, curvature and dark variances to photon-transfer points (n,) of all planes.
 
-    `signal`: mean above black, DN. `variance`: temporal variance, DN^2, with the standard deviation of its sampling.
-    `plane`: index 0.. . `light`: False for darks. `saturation`: DN above black. All points are taken as unsaturated;
-    those above 90 % of saturation are left out. The method: `lab.fit.noise`.
+    signal : mean above black, DN
+    variance, variance_std : temporal variance, DN^2, and the standard deviation of its sampling
+    plane : index of the plane, 0..
+    light : False for darks
+    saturation : DN above black; points above 90 % of it are left out, all others are taken as unsaturated
+
+    Source: the photon transfer method of EMVA 1288, section 6; the weights and the curvature: `lab.fit.noise`.
+
+    >>> signal = np.array([0.0, 100.0, 200.0, 300.0, 400.0, 500.0])
+    >>> variance = 4.0 + 0.5 * signal
+    >>> plane, light = np.zeros(6, int), signal > 0.0
+    >>> fit = fit_transfer(signal, variance, 0.01 * variance, plane, light, 1000.0)
+    >>> round(fit.gain, 3), round(float(fit.floor[0]), 2)
+    (0.5, 4.0)
     """
     points = TransferPoints(signal, variance, variance_std / variance, plane, light, saturation)
     for limit in (CURVE_LIMIT, LINE_LIMIT):
@@ -178,7 +189,7 @@ class TransferPoints:
     saturation: float
 
     def curve(self, used: NDArray[np.bool_], errors: tuple[float, float]) -> TransferCurve:
-        """Weighted least squares of the curve over the points `used` (n,), with a normal prior on its curvature.
+        """Fit the curve by weighted least squares over the points `used` (n,), with a normal prior on its curvature.
 
         `errors`: relative errors of the model in darks and in flats, in addition to sampling.
         """
@@ -204,8 +215,8 @@ class TransferPoints:
         return TransferCurve(solution, covariance, chi2, freedom, v - basis @ solution, std, fitted, leverage)
 
     def model_errors(self, used: NDArray[np.bool_], curve: TransferCurve) -> tuple[float, float]:
-        """Relative errors of the model in darks and in flats: those for which chi2 has its expected value; 0 where
-        sampling explains the residuals, for the flats the usual error where these are too few to tell
+        """Return the relative errors of the model in darks and in flats: those for which chi2 has its expected value; 0
+        where sampling explains the residuals, for the flats the usual error where these are too few to tell
         (`LEAST_FREEDOM`).
 
         Source: Paule and Mandel, J. Res. Natl. Bur. Stand. 87, 377 (1982).
@@ -236,14 +247,16 @@ class TransferPoints:
         return float(np.sqrt(squares[0])), float(np.sqrt(max(squares[1], least)))
 
     def dark_variances(self, error: float, gain: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """By plane: variance of the darks less the shot noise of their own signal (`gain` times it), its standard
-        deviation, and that signal.
+        """Return, by plane, the variance of the darks less the shot noise of their own signal (`gain` times it), its
+        standard deviation, and that signal.
         """
         values, stds, signals = [], [], []
         for index in range(int(self.plane.max()) + 1):
-            own = ~self.light & (self.plane == index)
-            weight = 1.0 / (np.hypot(self.relative[own], error) * self.variance[own]) ** 2
-            values.append(float(np.average(self.variance[own] - gain * self.signal[own], weights=weight)))
-            signals.append(float(np.average(self.signal[own], weights=weight)))
+            darks_of_plane = ~self.light & (self.plane == index)
+            weight = 1.0 / (np.hypot(self.relative[darks_of_plane], error) * self.variance[darks_of_plane]) ** 2
+            values.append(
+                float(np.average(self.variance[darks_of_plane] - gain * self.signal[darks_of_plane], weights=weight))
+            )
+            signals.append(float(np.average(self.signal[darks_of_plane], weights=weight)))
             stds.append(float(weight.sum() ** -0.5))
         return np.array(values), np.array(stds), np.array(signals)

@@ -57,18 +57,25 @@ class NormalEquations:
     power: float
     count: int
 
-    def __add__(self, other: NormalEquations) -> NormalEquations:
+    def __add__(self, added: NormalEquations) -> NormalEquations:
         return NormalEquations(
-            self.gram + other.gram, self.right + other.right, self.power + other.power, self.count + other.count
+            self.gram + added.gram, self.right + added.right, self.power + added.power, self.count + added.count
         )
 
 
 def normal_equations(sharp: Array, blurred: Array, support: int) -> NormalEquations:
-    """Sum the exact normal equations over the pixels for which the whole kernel (support, support) sees `sharp`; both
-    pictures (rows, cols).
+    """Sum the exact normal equations over the pixels for which the whole kernel sees `sharp`.
+
+    sharp, blurred : (rows, cols)
+    support : rows and columns of the kernel, odd
 
     The sums over the windows of all elements are those over the window of the last element, updated by the rows and
     columns that enter and leave: O(support^2 pixels) instead of O(support^4 pixels).
+
+    >>> sharp = np.random.default_rng(1).random((12, 14))
+    >>> equations = normal_equations(sharp, sharp, 3)
+    >>> bool(np.allclose(np.linalg.solve(equations.gram, equations.right), [0, 0, 0, 0, 1, 0, 0, 0, 0]))
+    True
     """
     s, h = support, support // 2
     rows, cols = sharp.shape
@@ -100,10 +107,10 @@ def _window_sums(picture: Array, tall: int, wide: int) -> Array:
     return np.asarray(by_row[:, wide:] - by_row[:, : by_row.shape[1] - wide])
 
 
-def _sum_lagged(u: Array, other: Array, tall: int, wide: int) -> Array:
-    """Sum u[r, c] other[r, c + lag] over the windows of `tall` x `wide` that begin at (row, col): (s, s, 2 s - 1).
+def _sum_lagged(u: Array, v: Array, tall: int, wide: int) -> Array:
+    """Sum u[r, c] v[r, c + lag] over the windows of `tall` x `wide` that begin at (row, col): (s, s, 2 s - 1).
 
-    `u` (rows, cols), `other` (rows, cols + 2 s - 2), s = cols - wide + 1. Over the first window by matrix products of
+    `u` (rows, cols), `v` (rows, cols + 2 s - 2), s = cols - wide + 1. Over the first window by matrix products of
     blocks of columns, of which the diagonals are the lags; over the others by what their rows and columns add and leave
     out.
     """
@@ -113,16 +120,16 @@ def _sum_lagged(u: Array, other: Array, tall: int, wide: int) -> Array:
     by_column = np.empty((cols, lags))  # over the first `tall` rows
     for first in range(0, cols, 2 * s):
         last = min(first + 2 * s, cols)
-        products = u[:tall, first:last].T @ other[:tall, first : last + lags - 1]
+        products = u[:tall, first:last].T @ v[:tall, first : last + lags - 1]
         row, item = products.strides
         by_column[first:last] = np.lib.stride_tricks.as_strided(products, (last - first, lags), (row + item, item))
-    views = np.lib.stride_tricks.sliding_window_view(other, lags, axis=1)  # (rows, cols, lags)
+    views = np.lib.stride_tricks.sliding_window_view(v, lags, axis=1)  # (rows, cols, lags)
     enters, leaves = np.arange(tall, tall + s - 1), np.arange(s - 1)
     # Down the rows: over the first `wide` columns together, and each column that a window further right leaves out or
     # adds
     within = np.empty((s, lags))
     within[0] = by_column[:wide].sum(axis=0)
-    row_sums = _row_products(u[:, :wide], other[:, : wide + lags - 1], np.concatenate([enters, leaves]))
+    row_sums = _row_products(u[:, :wide], v[:, : wide + lags - 1], np.concatenate([enters, leaves]))
     within[1:] = within[0] + np.cumsum(row_sums[: s - 1] - row_sums[s - 1 :], axis=0)
     change = np.empty((s, s - 1, lags))  # of a window one further right
     change[0] = by_column[wide:] - by_column[: s - 1]
@@ -135,9 +142,9 @@ def _sum_lagged(u: Array, other: Array, tall: int, wide: int) -> Array:
     return out
 
 
-def _row_products(u: Array, other: Array, rows: NDArray[np.int64]) -> Array:
-    """Sum u[r, c] other[r, c + lag] over the columns, for chosen `rows`: (rows, lags)."""
-    views = np.lib.stride_tricks.sliding_window_view(other, u.shape[1], axis=1)  # (rows, lags, cols)
+def _row_products(u: Array, v: Array, rows: NDArray[np.int64]) -> Array:
+    """Sum u[r, c] v[r, c + lag] over the columns, for chosen `rows`: (rows, lags)."""
+    views = np.lib.stride_tricks.sliding_window_view(v, u.shape[1], axis=1)  # (rows, lags, cols)
     return np.array([views[r] @ u[r] for r in rows]).reshape(len(rows), views.shape[1])
 
 
@@ -161,10 +168,19 @@ def normal_equations_right(sharp: Array, blurred: Array, support: int) -> tuple[
 
 
 def on_simplex(quadratic: Array, linear: Array, start: Array, solves: int = MOST_SOLVES) -> Array:
-    """Minimise 1/2 x^T Q x - c^T x over x >= 0, sum x = 1, from `start` (n,): `quadratic` Q (n, n), `linear` c (n,).
+    """Minimise 1/2 x^T Q x - c^T x over x >= 0, sum x = 1.
 
-    Accelerated projected gradients with restarts (O'Donoghue and Candes 2015), then an exact active-set step. `solves`
-    limits that step, each iteration of which costs one factorisation; it ends by itself at the optimum.
+    quadratic : Q (n, n), positive definite
+    linear : c (n,)
+    start : x to begin with, (n,)
+    solves : limit of the active-set step, each iteration of which costs one factorisation; it ends by itself at the
+        optimum
+
+    Returns x (n,). Accelerated projected gradients with restarts (O'Donoghue and Candes 2015), then an exact active-set
+    step.
+
+    >>> on_simplex(np.eye(3), np.array([0.9, 0.3, -1.0]), np.full(3, 1.0 / 3.0)).round(6).tolist()
+    [0.8, 0.2, 0.0]
     """
     scale = np.sqrt(np.diag(quadratic).mean())
     q, c = quadratic / scale**2, linear / scale**2
@@ -320,7 +336,15 @@ def _both_axes(vectors: Array, matrix: Array) -> Array:
 
 
 def envelope_of(kernel: Array) -> Array:
-    """Return the local mean of a kernel over about a pixel, at least 5e-4 of its maximum; the largest is 1."""
+    """Return the local mean of a kernel over about a pixel, at least 5e-4 of its maximum; the largest is 1.
+
+    kernel : (support, support)
+
+    Returns (support^2,).
+
+    >>> float(envelope_of(np.pad([[1.0]], 2)).reshape(5, 5)[2, 2])
+    1.0
+    """
     local = ndimage.gaussian_filter(kernel, 0.6, mode="constant")
     return np.asarray(np.maximum(local / local.max(), 5e-4).ravel())
 
@@ -410,13 +434,14 @@ def solve_kernel(
     given = prior_of or start_from
     if given is None:
         flat = np.full(total, 1.0 / total)
-        found = on_simplex(normal.gram + 1e-9 * scale * np.eye(total), normal.right, flat, 6)
+        solution = on_simplex(normal.gram + 1e-9 * scale * np.eye(total), normal.right, flat, 6)
     else:
-        found = np.append(given.kernel.ravel() * (1.0 - given.outside), [given.outside] * outside)
+        solution = np.append(given.kernel.ravel() * (1.0 - given.outside), [given.outside] * outside)
     residual = max(
-        normal.power - 2.0 * float(np.vdot(normal.right, found)) + float(np.vdot(found, normal.gram @ found)), 0.0
+        normal.power - 2.0 * float(np.vdot(normal.right, solution)) + float(np.vdot(solution, normal.gram @ solution)),
+        0.0,
     )
-    freedom = max(normal.count - int(np.count_nonzero(found > 0.0)), 1)
+    freedom = max(normal.count - int(np.count_nonzero(solution > 0.0)), 1)
     if noise_std is None and prior_of is not None:
         noise_std = prior_of.noise_std
     noise = float(np.sqrt(residual / freedom)) if noise_std is None else float(noise_std)
@@ -436,19 +461,19 @@ def solve_kernel(
         precision[size, size] = OUTSIDE_STD**-2
     at = (2, 1)
     for last in range(1 - rounds if prior_of is None else 1, 1):
-        prior, at = find_most_likely_prior(reduced, reduced_right, found[:size].reshape(support, support), at)
+        prior, at = find_most_likely_prior(reduced, reduced_right, solution[:size].reshape(support, support), at)
         precision[:size, :size] = prior.precision()
-        found = on_simplex(information + precision, weighted, found, solves if last == 0 else 3)
+        solution = on_simplex(information + precision, weighted, solution, solves if last == 0 else 3)
     if prior_of is not None:
         prior, precision = (
             KernelPrior(envelope_of(prior_of.kernel), prior_of.length_px, prior_of.strength),
             prior_of.precision,
         )
-        found = on_simplex(information + precision, weighted, found, solves)
-    share = float(found[:size].sum())
+        solution = on_simplex(information + precision, weighted, solution, solves)
+    share = float(solution[:size].sum())
     posterior = prior.posterior(reduced) / share**2
     return KernelEstimate(
-        kernel=found[:size].reshape(support, support) / share,
+        kernel=solution[:size].reshape(support, support) / share,
         kernel_std=np.sqrt(np.clip(np.diag(posterior), 0.0, None)).reshape(support, support),
         covariance=posterior,
         noise_std=noise,
@@ -461,7 +486,15 @@ def solve_kernel(
 
 
 def displace(picture: Array, field: Array) -> Array:
-    """Read `picture` (rows, cols) at each pixel's place plus `field` (2, rows, cols), px, by splines of order 5."""
+    """Read `picture` at each pixel's place plus `field`, by splines of order 5.
+
+    picture : (rows, cols)
+    field : displacement in rows and in columns, (2, rows, cols), px
+
+    >>> ramp = np.tile(np.arange(20.0), (20, 1))
+    >>> float(displace(ramp, np.full((2, 20, 20), 0.25))[10, 10].round(3))
+    10.25
+    """
     rows, cols = np.indices(picture.shape, dtype=float)
     return np.asarray(ndimage.map_coordinates(picture, [rows + field[0], cols + field[1]], order=5, mode="nearest"))
 
@@ -567,15 +600,32 @@ def estimate_kernel(
     *,
     register: bool = True,
 ) -> KernelEstimate:
-    """Estimate the kernel that blurs `sharp` into `blurred`, both (rows, cols); `support` is odd.
+    """Estimate the kernel that blurs `sharp` into `blurred`.
 
         blurred[r, c] = sum_ij kernel[i, j] sharp[r - i + support // 2, c - j + support // 2] + noise
 
-    on the rows and columns at least support // 2 from the border; kernel >= 0, sum 1. `noise_std` is estimated from
-    the residual where it isn't given. With `register`, where the residual shows that `sharp` was drawn a little off
-    its place (`displacement`), the places are refined together with the kernel, except a common shift, which belongs
-    to the kernel. Raises ValueError for arguments of the wrong shape or size; `NotDetermined` where the picture is
-    smaller than 2 x support, isn't finite or has no structure, or where `sharp` doesn't explain `blurred`.
+    on the rows and columns at least support // 2 from the border; kernel >= 0, sum 1.
+
+    sharp, blurred : (rows, cols)
+    support : rows and columns of the kernel, odd
+    noise_std : standard deviation of the noise, in the unit of `blurred`; by default it is estimated from the residual
+    register : where the residual shows that `sharp` was drawn a little off its place (`displacement`), refine the
+        places together with the kernel, except a common shift, which belongs to the kernel
+
+    Returns the kernel and its standard deviation, (support, support). Raises ValueError for arguments of the wrong
+    shape or size; `NotDetermined` where the picture is smaller than 2 x support, isn't finite or has no structure, or
+    where `sharp` doesn't explain `blurred`.
+
+    >>> import calibench
+    >>> import numpy as np
+    >>> from scipy.signal import convolve
+    >>> rng = np.random.default_rng(1)
+    >>> sharp = rng.random((60, 60))
+    >>> truth = np.array([[0.0, 0.1, 0.0], [0.1, 0.5, 0.2], [0.0, 0.1, 0.0]])
+    >>> blurred = convolve(sharp, truth, mode="same") + 1e-3 * rng.standard_normal((60, 60))
+    >>> estimate = calibench.estimate_kernel(sharp, blurred, 3, noise_std=1e-3)
+    >>> estimate.kernel.round(2).tolist()[1]
+    [0.1, 0.5, 0.2]
     """
     u, b = np.asarray(sharp, dtype=float), np.asarray(blurred, dtype=float)
     if u.shape != b.shape or u.ndim != 2:
@@ -594,9 +644,9 @@ def estimate_kernel(
     from scipy.signal import fftconvolve  # here: the library takes a while to load
 
     normal = normal_equations(u, b, support)
-    found = solve_kernel(normal, support, noise_std, rounds=1, solves=BRIEF_SOLVES)
+    solved = solve_kernel(normal, support, noise_std, rounds=1, solves=BRIEF_SOLVES)
     inner = np.s_[support // 2 : u.shape[0] - support // 2, support // 2 : u.shape[1] - support // 2]
-    kernel, predicted = found.kernel, fftconvolve(u, found.kernel, mode="same")
+    kernel, predicted = solved.kernel, fftconvolve(u, solved.kernel, mode="same")
     _refuse_unrelated(predicted[inner], b[inner])
     field = displacement(predicted, b, support // 2) if register else None
     if field is not None:
@@ -611,13 +661,13 @@ def estimate_kernel(
             if step < DISPLACEMENT_STEPS - 1:
                 noise2 = float(np.mean((b - moved)[inner] ** 2))
                 elements = on_simplex(
-                    normal.gram + noise2 * found.precision, normal.right, kernel.ravel(), BRIEF_SOLVES
+                    normal.gram + noise2 * solved.precision, normal.right, kernel.ravel(), BRIEF_SOLVES
                 )
                 kernel = elements.reshape(support, support)
                 predicted = fftconvolve(u, kernel, mode="same")
                 field = displacement(predicted, b, support // 2, field)
-        found = replace(found, kernel=kernel)
-    return solve_kernel(normal, support, noise_std, start_from=found, rounds=ROUNDS - 1)
+        solved = replace(solved, kernel=kernel)
+    return solve_kernel(normal, support, noise_std, start_from=solved, rounds=ROUNDS - 1)
 
 
 def _refuse_unrelated(predicted: Array, seen: Array) -> None:

@@ -72,7 +72,7 @@ def estimate_from_photograph(
         _align(seen, target, ScreenWarp.of_corners(orientation, target.shape), (2.5, 1.5))
         for orientation in orientations
     ]
-    warp, _ = max(rough, key=lambda found: found[1])
+    warp, _ = max(rough, key=lambda warp_and_score: warp_and_score[1])
     warp, correlation = _align(seen, target, warp, (1.0, 0.7, 0.5))
     if correlation < LEAST_CORRELATION:
         raise NotDetermined("psf", f"the photograph doesn't show the pattern (correlation {max(correlation, 0.0):.2f})")

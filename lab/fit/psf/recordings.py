@@ -127,8 +127,8 @@ def fit_psf_field(recordings: RecordingSet, side: Side, patches: int = 3) -> Psf
         except NotDetermined as refused:
             reason = f"{first}: {refused.reason}"
             continue
-        kernels += [_result(camera, first, found) for found in field.kernels.values()]
-        parts += [_result(camera, first, found) for found in field.parts]
+        kernels += [_result(camera, first, kernel) for kernel in field.kernels.values()]
+        parts += [_result(camera, first, kernel) for kernel in field.parts]
         measured += field.parts
     if not kernels:
         raise NotDetermined("psf", reason)
@@ -150,15 +150,15 @@ def _field_of(recordings: RecordingSet, camera: DataSheet, pose: ScreenPose, pat
     return measure_field(shares, recordings.target(first.target), place.warp, camera.cfa, patches=patches)
 
 
-def _result(camera: DataSheet, capture: str, found: ScreenKernel) -> PsfKernel:
+def _result(camera: DataSheet, capture: str, kernel: ScreenKernel) -> PsfKernel:
     """State a kernel as it stands in the results."""
     return PsfKernel(
         capture=capture,
-        channel=found.channel,
-        field_mm=_field_mm(camera, found.centre_px),
+        channel=kernel.channel,
+        field_mm=_field_mm(camera, kernel.centre_px),
         sample_pitch_px=1.0,
-        psf=tuple(tuple(float(v) for v in values) for values in found.kernel),
-        psf_std=tuple(tuple(float(v) for v in values) for values in found.kernel_std),
+        psf=tuple(tuple(float(v) for v in values) for values in kernel.kernel),
+        psf_std=tuple(tuple(float(v) for v in values) for values in kernel.kernel_std),
     )
 
 

@@ -35,7 +35,11 @@ SHIFT_STD_PX = 0.005  # common to all corners, beside their noise: shading diffe
 def on_pixels(fine: Array, oversample: int) -> Array:
     """Bring a kernel from samples of 1 / `oversample` px to pixels, sum 1.
 
-    `fine` (size, size), size = 2 n + 1 samples.
+    fine : (size, size), size = 2 n + 1 samples
+    oversample : samples in a pixel
+
+    >>> bool(np.isclose(on_pixels(np.pad([[1.0]], 12), 4).sum(), 1.0))
+    True
     """
     matrix = pixel_matrix(len(fine), oversample)
     kernel = matrix @ fine @ matrix.T
@@ -45,8 +49,14 @@ def on_pixels(fine: Array, oversample: int) -> Array:
 def pixel_matrix(size: int, oversample: int) -> Array:
     """Return the matrix (pixels, size) of one axis of `on_pixels`.
 
+    size : samples of the kernel along the axis, odd
+    oversample : samples in a pixel
+
     Light spread over a pixel is light spread over `oversample` adjacent samples: a filter with the response sinc(f) /
     sinc(f / oversample).
+
+    >>> pixel_matrix(25, 4).shape
+    (5, 25)
     """
     reach = oversample
     half = (size // 2 - oversample // 2) // oversample
@@ -61,7 +71,14 @@ def pixel_matrix(size: int, oversample: int) -> Array:
 def symmetric_taps(response: Callable[[Array], Array], highest_cy_per_px: float, oversample: int, reach: int) -> Array:
     """Design 2 reach + 1 symmetric filter taps on samples of 1 / `oversample` px, sum 1.
 
-    Their frequency response is the least-squares fit of `response` (cy/px) up to `highest_cy_per_px`.
+    response : frequency response, a function of frequencies (n,), cy/px
+    highest_cy_per_px : up to which the response is fitted by least squares
+    oversample : samples in a pixel
+    reach : taps on each side of the middle one
+
+    >>> taps = symmetric_taps(np.ones_like, 0.5, 1, 2)
+    >>> bool(np.allclose(taps, [0.0, 0.0, 1.0, 0.0, 0.0]))
+    True
     """
     frequency = np.linspace(0.0, highest_cy_per_px, 61)
     order = np.arange(reach + 1)
@@ -147,13 +164,13 @@ class DrawnPattern:
         pixels.
         """
         across = [np.linspace(v.min(), v.max() + 1, count + 1) for v in (self.row, self.col)]
-        found = []
+        parts = []
         for top, bottom in zip(across[0][:-1], across[0][1:], strict=True):
             for left, right in zip(across[1][:-1], across[1][1:], strict=True):
                 chosen = (self.row >= top) & (self.row < bottom) & (self.col >= left) & (self.col < right)
                 if np.count_nonzero(chosen) >= 2 * self.support**2:
-                    found.append(self.within(chosen))
-        return found
+                    parts.append(self.within(chosen))
+        return parts
 
     def within(self, chosen: NDArray[np.bool_]) -> DrawnPattern:
         """Return the pattern with the pixels `chosen`, (n,), alone."""
@@ -233,8 +250,8 @@ class ScreenKernel:
         size = fine.kernel.size
         data = fine.information[:, :size] @ (np.asarray(fine_kernel, dtype=float).ravel() * (1.0 - self.outside))
         data = data + fine.information[:, size] * self.outside
-        found = on_simplex(fine.information + fine.precision, data, np.append(fine.kernel.ravel(), self.outside))
-        return on_pixels(found[:size].reshape(fine.kernel.shape), self.oversample)
+        solution = on_simplex(fine.information + fine.precision, data, np.append(fine.kernel.ravel(), self.outside))
+        return on_pixels(solution[:size].reshape(fine.kernel.shape), self.oversample)
 
 
 @dataclass(frozen=True)
@@ -269,7 +286,7 @@ def measure_field(
         raise ValueError(f"oversample = {oversample} must be 2 or 4 samples a pixel")
     places, step = phases(cfa), period(cfa)
     reference = "Y" if cfa == "MONO" else "G"
-    found: dict[str, ScreenKernel] = {}
+    kernel_of_channel: dict[str, ScreenKernel] = {}
     local: list[ScreenKernel] = []
     size = support_px
 
@@ -286,13 +303,13 @@ def measure_field(
         if channel != reference:
             drawn = draw_for(channel, drawn.refine_warp(estimate))
         whole = solve_kernel(drawn.normal(), drawn.support, outside=True)
-        found[channel] = screen_kernel(drawn, channel, whole)
+        kernel_of_channel[channel] = screen_kernel(drawn, channel, whole)
         if channel == reference and patches > 1:
             local = [
                 screen_kernel(part, channel, solve_kernel(part.normal(), part.support, outside=True, prior_of=whole))
                 for part in drawn.parts(patches)
             ]
-    return ScreenField({channel: found[channel] for channel in places}, tuple(local))
+    return ScreenField({channel: kernel_of_channel[channel] for channel in places}, tuple(local))
 
 
 def _rim_share(kernel: Array, oversample: int) -> float:
@@ -335,13 +352,22 @@ def expected_kernel(
     """Return the kernel on the pixels of the sensor, (support, support), sum 1, that `measure_field` converges to for a
     transfer function of lens and pixel.
 
-    `transfer(fx, fy)`, in cy/px, broadcasts over both. `cell_px`: size of a cell of the pattern. The kernel is the
-    least-squares solution on samples of 1 / `oversample` px that maps the drawing of a random pattern to what the
-    pixels record of it. Where a lens passes detail beyond what these samples resolve, it differs from samples of the
-    point-spread function, because borders of cells lie between the samples. With P the power spectrum of the pattern,
-    D the response of the drawing and H the transfer function, the normal equations at samples n, m are
+    transfer : transfer(fx, fy), frequencies in cy/px, which broadcast against each other
+    support_px : size of the kernel, px
+    cell_px : size of a cell of the pattern, px
+    oversample : samples in a pixel
+
+    The kernel is the least-squares solution on samples of 1 / `oversample` px that maps the drawing of a random pattern
+    to what the pixels record of it. Where a lens passes detail beyond what these samples resolve, it differs from
+    samples of the point-spread function, because borders of cells lie between the samples. With P the power spectrum of
+    the pattern, D the response of the drawing and H the transfer function, the normal equations at samples n, m are
 
         sum_m k(m) integral P D^2 exp(2 pi i f (n - m)) df = integral P D H exp(2 pi i f n) df
+
+    >>> gaussian = lambda fx, fy: np.exp(-2.0 * (np.pi * 0.6) ** 2 * (fx**2 + fy**2)).astype(complex)
+    >>> kernel = expected_kernel(gaussian, 5, 2.0)
+    >>> kernel.shape, bool(kernel[2, 2] == kernel.max())
+    ((5, 5), True)
     """
     support = oversample * support_px + 1
     fine = 4 * oversample
@@ -355,13 +381,13 @@ def expected_kernel(
     power = np.square(np.sinc(cell_px * fy))[:, None] * np.square(np.sinc(cell_px * fx))
     drawn = drawn_y[:, None] * drawn_x
     every = fine // oversample
-    own = np.fft.irfft2(power * drawn**2, (count, count))[::every, ::every]
+    autocorrelation = np.fft.irfft2(power * drawn**2, (count, count))[::every, ::every]
     cross = np.fft.irfft2(power * drawn * transfer(fx[None, :], fy[:, None]), (count, count))[::every, ::every]
     place = np.arange(support) - support // 2
     lag = place[:, None] - place
-    matrix = own[lag[:, None, :, None], lag[None, :, None, :]].reshape(support**2, support**2)
+    matrix = autocorrelation[lag[:, None, :, None], lag[None, :, None, :]].reshape(support**2, support**2)
     # A small ridge where the pattern has no power; the sum is known far better, from the mean of the pattern
-    matrix = matrix + 1e-4 * own[0, 0] * np.eye(support**2)
-    mean = 1e3 * own[0, 0]
+    matrix = matrix + 1e-4 * autocorrelation[0, 0] * np.eye(support**2)
+    mean = 1e3 * autocorrelation[0, 0]
     kernel = np.linalg.solve(matrix + mean, cross[place[:, None], place].ravel() + mean)
     return on_pixels(kernel.reshape(support, support), oversample)

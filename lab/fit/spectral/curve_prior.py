@@ -23,7 +23,14 @@ FINE_LENGTH_NM = 5.0  # correlation length of the fine structure
 
 
 def averaging_matrix(wave: FloatArray) -> FloatArray:
-    """Return the matrix (m, m) of Gaussian averages over `LOCAL_WIDTH_NM`."""
+    """Return the matrix (m, m) of Gaussian averages over `LOCAL_WIDTH_NM`.
+
+    wave : wavelengths (m,), nm
+
+    >>> wave = np.arange(400.0, 701.0, 10.0)
+    >>> bool(np.allclose(averaging_matrix(wave) @ np.ones(wave.size), 1.0))
+    True
+    """
     distance = (wave[:, None] - wave) / LOCAL_WIDTH_NM
     average = np.exp(-0.5 * distance**2)
     average /= average.sum(axis=1, keepdims=True)
@@ -31,10 +38,17 @@ def averaging_matrix(wave: FloatArray) -> FloatArray:
 
 
 def local_roughness(wave: FloatArray, curve: FloatArray, average: FloatArray) -> FloatArray | None:
-    """Return the roughness (m,) of a curve, maximum 1: the geometric mean of its curvature and its height, both
-    averaged by `average` (m, m). None for a straight line.
+    """Return the roughness (m,) of a curve, maximum 1: the geometric mean of its curvature and its height.
 
-    `wave` (m,), nm; `curve` (m,).
+    wave, curve : wavelengths, nm, and values, (m,)
+    average : matrix (m, m) by which curvature and height are averaged, as of `averaging_matrix`
+
+    Returns None for a straight line.
+
+    >>> wave = np.arange(400.0, 701.0, 10.0)
+    >>> peak = np.exp(-0.5 * ((wave - 550.0) / 30.0) ** 2)
+    >>> float(wave[np.argmax(local_roughness(wave, peak, averaging_matrix(wave)))])
+    550.0
     """
     if wave.size < 5:
         return None
@@ -45,10 +59,13 @@ def local_roughness(wave: FloatArray, curve: FloatArray, average: FloatArray) ->
 
 
 def smooth_root(wave: FloatArray, roughness: FloatArray) -> FloatArray:
-    """Return the root (m, m) of curves whose second difference is white with standard deviation `roughness`, up to
-    straight lines.
+    """Return the root (m, m) of the covariance of curves whose second difference is white, up to straight lines.
 
-    `wave`, `roughness` (m,): wavelengths, nm, and standard deviations.
+    wave, roughness : wavelengths, nm, and standard deviations of the second difference, (m,)
+
+    >>> root = smooth_root(np.arange(400.0, 450.0, 10.0), np.ones(5))
+    >>> root.shape, float(root[0].max())
+    ((5, 5), 0.0)
     """
     return np.clip(wave[:, None] - wave, 0.0, None) * (np.sqrt(np.gradient(wave)) * roughness)
 
@@ -62,10 +79,16 @@ def rough_root(wave: FloatArray, roughness: FloatArray, fine_share: float) -> Fl
 
 
 def fine_covariance(wave: FloatArray, roughness: FloatArray, fine_share: float) -> FloatArray:
-    """Return the covariance (m, m) of fine structure: exponential correlation over 5 nm, as high as `fine_share` of
-    what the curvature amounts to over 10 nm.
+    """Return the covariance (m, m) of fine structure: exponential correlation over 5 nm.
+
+    wave, roughness : wavelengths, nm, and standard deviations of the curve's second difference, (m,)
+    fine_share : its standard deviation over that of the curvature, accumulated over 10 nm
 
     The lights hardly determine it; the uncertainty has to include it.
+
+    >>> covariance = fine_covariance(np.array([400.0, 405.0]), np.ones(2), 0.1)
+    >>> round(float(covariance[0, 1] / covariance[0, 0]), 4)
+    0.3679
     """
     height = fine_share * LOCAL_WIDTH_NM**1.5 * roughness
     return np.asarray(np.outer(height, height) * np.exp(-np.abs(wave[:, None] - wave) / FINE_LENGTH_NM))
@@ -85,7 +108,13 @@ def signal_covariance(wave: FloatArray, operator: FloatArray, roughness: FloatAr
 
 
 def straight_lines(wave: FloatArray) -> FloatArray:
-    """Return the constant and the slope, (m, 2): the curves without a second difference."""
+    """Return the constant and the slope, (m, 2): the curves without a second difference.
+
+    wave : wavelengths (m,), nm
+
+    >>> straight_lines(np.array([400.0, 500.0, 600.0])).tolist()
+    [[1.0, -1.0], [1.0, 0.0], [1.0, 1.0]]
+    """
     return np.stack([np.ones_like(wave), 2.0 * (wave - wave.mean()) / np.ptp(wave)], axis=1)
 
 
@@ -157,10 +186,20 @@ def posterior_under_prior(
 
 
 def least_misfit(covariance: FloatArray, line: FloatArray, value: FloatArray, std: FloatArray) -> tuple[float, float]:
-    """Minimise the negative log marginal likelihood of value = line a + strength u + noise over the strength. Returns
-    it and that strength.
+    """Minimise the negative log marginal likelihood of value = line a + strength u + noise over the strength.
 
-    u is normal with `covariance` (n, n), a (2,) is free and integrated out. `line` (n, 2), `value`, `std` (n,).
+    covariance : of u, (n, n)
+    line : (n, 2); a (2,) is free and integrated out
+    value, std : signals and their standard deviations, (n,)
+
+    Returns the minimum and the strength.
+
+    >>> rng = np.random.default_rng(1)
+    >>> line = np.stack([np.ones(400), np.linspace(-1.0, 1.0, 400)], axis=1)
+    >>> value = line @ [3.0, 1.0] + 2.0 * rng.standard_normal(400)
+    >>> _, strength = least_misfit(np.eye(400), line, value, np.full(400, 1e-3))
+    >>> bool(abs(strength - 2.0) < 3.0 * 2.0 / np.sqrt(2.0 * 400.0))  # of a standard deviation from 400 values
+    True
     """
     z, h = value / std, line / std[:, None]
     rest = linalg.qr(h)[0][:, line.shape[1] :]
@@ -175,10 +214,10 @@ def least_misfit(covariance: FloatArray, line: FloatArray, value: FloatArray, st
     start = -np.log(max(float(eigenvalue.max()), 1e-300))
     grid = start + np.linspace(-2.0, 40.0, 85)
     best = int(np.argmin([loss(g) for g in grid]))
-    found = optimize.minimize_scalar(
+    minimum = optimize.minimize_scalar(
         loss, bounds=(grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]), method="bounded"
     )
-    return float(found.fun), float(np.exp(0.5 * found.x))
+    return float(minimum.fun), float(np.exp(0.5 * minimum.x))
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,11 +49,11 @@ def solve_with_maker(
     def blocks(operators: Sequence[FloatArray], kernel: FloatArray) -> FloatArray:
         return linalg.block_diag(*(o @ kernel @ o.T for o in operators))
 
-    own = [o * m for o, m in zip(scaled, maker, strict=True)]
-    pieces = [through @ kernel_smooth @ through.T, blocks(own, kernel_smooth), blocks(scaled, local)]
+    own_of_channel = [o * m for o, m in zip(scaled, maker, strict=True)]
+    pieces = [through @ kernel_smooth @ through.T, blocks(own_of_channel, kernel_smooth), blocks(scaled, local)]
     fixed = (
         COMMON_LINE_STD**2 * through @ kernel_line @ through.T
-        + OWN_LINE_STD**2 * blocks(own, kernel_line)
+        + OWN_LINE_STD**2 * blocks(own_of_channel, kernel_line)
         + np.eye(total)
     )
     peak = max(float(m.max()) for m in maker)
@@ -70,14 +70,14 @@ def solve_with_maker(
 
     centre = np.log([0.03, 0.003, 1e-3 * peak])
     starts = [centre, centre + np.array([3.0, 0.0, 0.0])]
-    found = min(
+    maximum = min(
         (
             optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02})
             for start in starts
         ),
         key=lambda result: float(result.fun),
     )
-    weight = np.exp(2.0 * found.x)
+    weight = np.exp(2.0 * maximum.x)
     factor = linalg.cho_factor(fixed + sum(w * p for w, p in zip(weight, pieces, strict=True)))
     common = COMMON_LINE_STD**2 * kernel_line + weight[0] * kernel_smooth
     single = OWN_LINE_STD**2 * kernel_line + weight[1] * kernel_smooth
@@ -88,7 +88,7 @@ def solve_with_maker(
         # Covariance of the curve with all signals, then its own
         cross = (m[:, None] * common) @ through.T
         at = slice(offsets[c], offsets[c + 1])
-        cross[:, at] += (m[:, None] * single) @ own[c].T + weight[2] * local @ scaled[c].T
+        cross[:, at] += (m[:, None] * single) @ own_of_channel[c].T + weight[2] * local @ scaled[c].T
         prior = np.outer(m, m) * (common + single) + weight[2] * local
         mean = m + cross @ linalg.cho_solve(factor, value)
         covariance = prior - cross @ linalg.cho_solve(factor, cross.T)
@@ -113,12 +113,24 @@ def compare_curves(
     """Find the wavelength bands in which fitted curves differ from stated ones, up to one factor that all channels
     share.
 
-    `value`, `stated` (channels x wavelengths,), channel after channel; `covariance` of `value` without what is common
-    to all. The factor is the median of value / stated where `stated` is above a fifth of its maximum: bands that
-    differ don't change it. Every band of neighbouring wavelengths of every channel is tested by its mean difference;
-    the significance (normal, two-sided) is corrected for the number of bands. Bands are taken by significance, each
-    apart from those before it, down to the level that curves which are as stated exceed in at most 1 % of fits.
+    wavelength_nm : (m,)
+    channels : their names
+    value, stated : fitted and stated curves (channels x m,), channel after channel
+    covariance : of `value`, without what is common to all
+
+    The factor is the median of value / stated where `stated` is above a fifth of its maximum: bands that differ don't
+    change it. Every band of neighbouring wavelengths of every channel is tested by its mean difference; the
+    significance (normal, two-sided) is corrected for the number of bands. Bands are taken by significance, each apart
+    from those before it, down to the level that curves which are as stated exceed in at most 1 % of fits.
+
     Returns the factor and the bands.
+
+    >>> wavelength_nm = np.arange(400.0, 500.0, 10.0)
+    >>> fitted = np.full(30, 0.55)
+    >>> fitted[15:17] = 0.45  # G at 450 and 460 nm
+    >>> factor, bands = compare_curves(wavelength_nm, ["R", "G", "B"], fitted, 0.01**2 * np.eye(30), np.full(30, 0.5))
+    >>> round(factor, 3), [(band.channel, band.from_nm, band.to_nm) for band in bands]
+    (1.1, [('G', 450.0, 460.0)])
     """
     high = stated > 0.2 * stated.max()
     scale = float(np.median(value[high] / stated[high]))
@@ -128,21 +140,21 @@ def compare_curves(
     covariance_of_difference = centre @ covariance @ centre.T + (STATED_DIGITS * stated.max()) ** 2 * np.eye(value.size)
     difference = value - scale * stated
     size = wavelength_nm.size
-    found: list[tuple[float, int, int, int]] = []
+    intervals: list[tuple[float, int, int, int]] = []
     for k in range(len(channels)):
-        own = slice(k * size, (k + 1) * size)
-        total = np.concatenate([[0.0], np.cumsum(difference[own])])
+        span = slice(k * size, (k + 1) * size)
+        total = np.concatenate([[0.0], np.cumsum(difference[span])])
         square = np.zeros((size + 1, size + 1))
-        square[1:, 1:] = np.cumsum(np.cumsum(covariance_of_difference[own, own], axis=0), axis=1)
+        square[1:, 1:] = np.cumsum(np.cumsum(covariance_of_difference[span, span], axis=0), axis=1)
         for a in range(size):
             for b in range(a + 1, size + 1):
                 variance = square[b, b] - 2.0 * square[a, b] + square[a, a]
-                found.append((abs(total[b] - total[a]) / float(np.sqrt(variance)), k, a, b))
-    tests = len(found)
+                intervals.append((abs(total[b] - total[a]) / float(np.sqrt(variance)), k, a, b))
+    tests = len(intervals)
     limit = float(special.ndtri(1.0 - 0.005 / tests))
     departures: list[MakerDeparture] = []
     taken = np.zeros((len(channels), size), bool)
-    for z, k, a, b in sorted(found, reverse=True):
+    for z, k, a, b in sorted(intervals, reverse=True):
         if z <= limit:
             break
         if taken[k, a:b].any():

@@ -94,17 +94,17 @@ def likely_widths(signals_of: Signals, scatter: Scatter, fine_share: float) -> L
     `signals_of`: wavelengths and signals by channel with the operators of a factor on the stated width. `scatter`: what
     was found at that.
     """
-    found = {factor: bandwidth_evidence(*signals_of(factor), scatter, fine_share) for factor in HALVES}
-    if max(found.values()) - found[1.0] < BANDWIDTH_LOG_RATIO:
+    evidence_of_factor = {factor: bandwidth_evidence(*signals_of(factor), scatter, fine_share) for factor in HALVES}
+    if max(evidence_of_factor.values()) - evidence_of_factor[1.0] < BANDWIDTH_LOG_RATIO:
         return None
-    found |= {factor: bandwidth_evidence(*signals_of(factor), scatter, fine_share) for factor in BETWEEN}
-    highest = max(found.values())
+    evidence_of_factor |= {factor: bandwidth_evidence(*signals_of(factor), scatter, fine_share) for factor in BETWEEN}
+    highest = max(evidence_of_factor.values())
     kept = {
         factor: float(np.exp(log - highest))
-        for factor, log in found.items()
+        for factor, log in evidence_of_factor.items()
         if log > highest + np.log(LEAST_WIDTH_SHARE)
     }
-    widest = max(factor for factor, log in found.items() if log > highest - BANDWIDTH_LOG_RATIO)
+    widest = max(factor for factor, log in evidence_of_factor.items() if log > highest - BANDWIDTH_LOG_RATIO)
     return LikelyWidths({factor: share / sum(kept.values()) for factor, share in kept.items()}, widest)
 
 
@@ -118,18 +118,18 @@ def bandwidth_evidence(
     """
     average, line = averaging_matrix(wave), straight_lines(wave)
     priors, start = [], []
-    for one in signals.values():
-        level = one.operator.sum(axis=1)
-        middle = one.operator @ wave / level
+    for of_channel in signals.values():
+        level = of_channel.operator.sum(axis=1)
+        middle = of_channel.operator @ wave / level
         order = np.argsort(middle)
-        local = local_roughness(wave, np.interp(wave, middle[order], (one.value / level)[order]), average)
+        local = local_roughness(wave, np.interp(wave, middle[order], (of_channel.value / level)[order]), average)
         local = np.zeros_like(wave) if local is None else local
-        std = one.with_scatter(scatter).std
+        std = of_channel.with_scatter(scatter).std
         tried = []
         for floor in ROUGHNESS_FLOORS[1::2]:
             for fine in (0.0, fine_share):  # curves without fine structure aren't evidence for light that would hide it
-                prior = signal_covariance(wave, one.operator, floor + local, fine)
-                tried.append((*least_misfit(prior, one.operator @ line, one.value, std), prior))
+                prior = signal_covariance(wave, of_channel.operator, floor + local, fine)
+                tried.append((*least_misfit(prior, of_channel.operator @ line, of_channel.value, std), prior))
         _, strength, prior = min(tried, key=lambda t: t[0])
         priors.append(prior)
         start.append(2.0 * np.log(strength))
@@ -266,11 +266,12 @@ def _lines_off_their_names(lit: Sequence[TableRow]) -> list[str]:
             off[stated_nm] = line.wavelength_nm
     if not off:
         return []
-    told, most = next(iter(off.items())), max(abs(measured - stated) for stated, measured in off.items())
+    stated_nm, measured_nm = next(iter(off.items()))
+    most_nm = max(abs(measured - stated) for stated, measured in off.items())
     return [
         (
-            f"{len(off)} lines are centred elsewhere than they are set, by {most:.1f} nm at most ({told[0]:g} nm: "
-            f"{told[1]:.1f} nm): the measured lines are used"
+            f"{len(off)} lines are centred elsewhere than they are set, by {most_nm:.1f} nm at most ({stated_nm:g} nm: "
+            f"{measured_nm:.1f} nm): the measured lines are used"
         )
     ]
 
@@ -307,12 +308,12 @@ def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Tabl
     )
     if power <= 0.0:
         raise InputError(f"{row.file}: row {row.number}: no light; leave the row out, or write kind dark")
-    own = [dark for dark in darks if _channel(dark, camera) == channel]
-    if darks and not own:
+    channel_darks = [dark for dark in darks if _channel(dark, camera) == channel]
+    if darks and not channel_darks:
         raise InputError(f"{row.file}: channel {channel} has no row of kind dark; add its mean in the dark")
     black, black_std = camera.black_level_dn or 0.0, 0.0
-    if own:
-        nearest = min(own, key=lambda dark: abs(dark.value("exposure_s") - exposure_s))
+    if channel_darks:
+        nearest = min(channel_darks, key=lambda dark: abs(dark.value("exposure_s") - exposure_s))
         black, black_std = nearest.value("mean_dn", -np.inf), nearest.value("mean_std_dn")
     if mean < black - BELOW_DARK_SIGMA * np.hypot(mean_std, black_std):
         raise InputError(
@@ -335,13 +336,13 @@ def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Tabl
 
 def _fit_curves(lights: Sequence[_TableLight], channels: Sequence[str], remarks: list[str]) -> SpectralFit:
     """Fit the curves of `channels` to the lights; `remarks` gets what is to be told. Raises `NotDetermined`."""
-    by_channel = {c: [one for one in lights if one.channel == c] for c in channels}
-    for channel, own in by_channel.items():
-        if len({one.wavelength_nm for one in own}) < MIN_SPECTRA:
+    by_channel = {c: [light for light in lights if light.channel == c] for c in channels}
+    for channel, channel_lights in by_channel.items():
+        if len({light.wavelength_nm for light in channel_lights}) < MIN_SPECTRA:
             raise NotDetermined(
                 "spectral", f"channel {channel} has fewer than {MIN_SPECTRA} lights; add means at other wavelengths"
             )
-    centres = [one.wavelength_nm for one in lights]
+    centres = [light.wavelength_nm for light in lights]
     out = (
         np.arange(np.ceil(min(centres) / OUTPUT_STEP_NM), np.floor(max(centres) / OUTPUT_STEP_NM) + 1) * OUTPUT_STEP_NM
     )
@@ -353,27 +354,27 @@ def _fit_curves(lights: Sequence[_TableLight], channels: Sequence[str], remarks:
     def signals_of(factor: float) -> tuple[FloatArray, dict[str, ChannelSignals]]:
         return _signals(by_channel, factor)
 
-    def solved_on(factor: float) -> tuple[FloatArray, FloatArray, Scatter]:
+    def solve_with_width(factor: float) -> tuple[FloatArray, FloatArray, Scatter]:
         wave, signals = signals_of(factor)
         solved, scatter = solve_sensitivities(wave, signals, FINE_SHARE)
         at = np.stack([np.interp(out, wave, row) for row in np.eye(wave.size)], axis=1)
-        curves = np.concatenate([at @ one.sensitivity for one in solved.values()])
+        curves = np.concatenate([at @ sensitivity.sensitivity for sensitivity in solved.values()])
         return curves, joint_covariance(at, solved), scatter
 
-    value, joint, scatter = solved_on(1.0)
-    is_stated = all(one.spectrum is None for one in lights)  # measured spectra are used as they are
+    value, joint, scatter = solve_with_width(1.0)
+    is_stated = all(light.spectrum is None for light in lights)  # measured spectra are used as they are
     widths = likely_widths(signals_of, scatter, FINE_SHARE) if is_stated else None
     if widths is not None:
-        stated = float(np.median([one.bandwidth_nm for one in lights]))
+        stated = float(np.median([light.bandwidth_nm for light in lights]))
         remarks.append(
             f"the stated bandwidth of {stated:g} nm contradicts the means, by odds above "
             f"{round(np.exp(BANDWIDTH_LOG_RATIO), -2):.0f}: light "
             f"of at most {widths.widest * stated:.1f} nm fits, and the sensitivities are fitted with it; measure the "
             "width of a line"
         )
-        parts = [(share, *solved_on(factor)) for factor, share in widths.share.items()]
+        parts = [(share, *solve_with_width(factor)) for factor, share in widths.share.items()]
         value = np.sum([share * curves for share, curves, *_ in parts], axis=0)
-        joint = np.sum([share * (own + np.outer(c - value, c - value)) for share, c, own, _ in parts], axis=0)
+        joint = np.sum([share * (within + np.outer(c - value, c - value)) for share, c, within, _ in parts], axis=0)
         scatter = max(parts, key=lambda part: part[0])[3]
     remarks += scatter_remarks(scatter)
     peak = int(np.argmax(value))
@@ -382,15 +383,15 @@ def _fit_curves(lights: Sequence[_TableLight], channels: Sequence[str], remarks:
     relative = np.sqrt(np.clip(variance, 0.0, None)) / value[peak]
     size = out.size
 
-    def told(array: FloatArray) -> dict[str, tuple[float, ...]]:
+    def split_by_channel(array: FloatArray) -> dict[str, tuple[float, ...]]:
         return {c: tuple(array[k * size : (k + 1) * size].tolist()) for k, c in enumerate(channels)}
 
     return SpectralFit(
         wavelength_nm=tuple(out.tolist()),
         quantum_efficiency={},
         quantum_efficiency_std={},
-        relative_sensitivity=told(ratio),
-        relative_sensitivity_std=told(relative),
+        relative_sensitivity=split_by_channel(ratio),
+        relative_sensitivity_std=split_by_channel(relative),
         coverage_factor=COVERAGE_FACTOR,
         remarks=tuple(remarks),
     )
@@ -411,25 +412,25 @@ def _signals(
     """Return the wavelengths (m,), and the signals of each channel in lights of `factor` times the stated bandwidth;
     photons and rates are relative.
     """
-    lights = [one for own in by_channel.values() for one in own]
-    low = min(one.wavelength_nm - factor * one.bandwidth_nm for one in lights)
-    high = max(one.wavelength_nm + factor * one.bandwidth_nm for one in lights)
+    lights = [light for channel_lights in by_channel.values() for light in channel_lights]
+    low = min(light.wavelength_nm - factor * light.bandwidth_nm for light in lights)
+    high = max(light.wavelength_nm + factor * light.bandwidth_nm for light in lights)
     wave = np.arange(np.floor(low), np.ceil(high) + GRID_NM, GRID_NM)
-    photons = float(np.median([one.power * one.wavelength_nm for one in lights]))
-    highest = max(abs(one.rate) for one in lights) or 1.0
-    found = {}
-    for channel, own in by_channel.items():
-        value = np.array([one.rate for one in own]) / highest
-        noise = np.array([one.rate_std for one in own]) / highest
-        found[channel] = ChannelSignals(
-            np.array([_photons(one, wave, factor) for one in own]) / photons * trapezoid_weights(wave),
+    photons = float(np.median([light.power * light.wavelength_nm for light in lights]))
+    highest = max(abs(light.rate) for light in lights) or 1.0
+    signals_of_channel = {}
+    for channel, channel_lights in by_channel.items():
+        value = np.array([light.rate for light in channel_lights]) / highest
+        noise = np.array([light.rate_std for light in channel_lights]) / highest
+        signals_of_channel[channel] = ChannelSignals(
+            np.array([_photons(light, wave, factor) for light in channel_lights]) / photons * trapezoid_weights(wave),
             value,
             np.hypot(noise, RADIOMETER_STD * value),
-            tuple(f"{one.wavelength_nm} nm, {one.power}" for one in own),
+            tuple(f"{light.wavelength_nm} nm, {light.power}" for light in channel_lights),
             np.zeros((0, wave.size)),
             np.zeros(0),
         )
-    return wave, found
+    return wave, signals_of_channel
 
 
 def _photons(light: _TableLight, wave: FloatArray, factor: float) -> FloatArray:

@@ -67,7 +67,9 @@ class SpectralCaptures:
         self.recordings, self.side, self.noise = recordings, side, noise
         #: Standard deviation of the mean of each repeat by a drift, DN: in the mean over the n repeats, where these
         #: count as independent, the drift's uncertainty is left whole.
-        self.drift_dn = {name: one.level_dn_std * len(one.mean_dn) ** 0.5 for one in drifts for name in one.captures}
+        self.drift_dn = {
+            name: drift.level_dn_std * len(drift.mean_dn) ** 0.5 for drift in drifts for name in drift.captures
+        }
         self.camera = recordings.camera(side)
         self.remarks: list[str] = []
         self.narrowband: list[NarrowbandCapture | FlatCapture] = [
@@ -173,35 +175,39 @@ class SpectralCaptures:
     def _read_darks(self) -> None:
         """Fit the dark means of the region against exposure, by gain and channel, of the temperature at which most
         narrowband captures were taken."""
-        found: dict[tuple[float, str], list[tuple[float, float, float]]] = {}
+        means_of_key: dict[tuple[float, str], list[tuple[float, float, float]]] = {}
         for dark in darks_near(self.recordings.captures(DarkCapture, self.side), self.narrowband):
-            for channel, one in self._means(dark).items():
-                own = found.setdefault((dark.gain_db or 0.0, channel), [])
-                std = float(np.hypot(one.mean_std_dn(self._step_dn), self.drift_dn.get(dark.id, 0.0)))
-                own.append((dark.exposure_s, one.mean_dn, std))
-        for key, rows in found.items():
+            for channel, channel_mean in self._means(dark).items():
+                means = means_of_key.setdefault((dark.gain_db or 0.0, channel), [])
+                std = float(np.hypot(channel_mean.mean_std_dn(self._step_dn), self.drift_dn.get(dark.id, 0.0)))
+                means.append((dark.exposure_s, channel_mean.mean_dn, std))
+        for key, rows in means_of_key.items():
             self.darks[key] = dark_line(*np.array(rows).T)
 
     def _dn_per_e(self, gain_db: float | None) -> float:
         """Return the conversion gain, DN/e, at a gain in dB."""
         return self.gain * 10.0 ** ((gain_db or 0.0) / 20.0)
 
-    def _electron_rate(self, capture: Capture, channel: str, found: ChannelMean) -> tuple[float, float, bool, float]:
+    def _electron_rate(
+        self, capture: Capture, channel: str, channel_mean: ChannelMean
+    ) -> tuple[float, float, bool, float]:
         """Return the electrons per second, their standard deviation, whether the capture saturates, and its share of
         saturation.
 
-        `found`: the channel's mean in the region.
+        `channel_mean`: the channel's mean in the region.
         """
         gain = self._dn_per_e(capture.gain_db)
         dark, dark_std = self._dark(capture.gain_db or 0.0, channel, capture.exposure_s)
-        signal = found.mean_dn - dark
+        signal = channel_mean.mean_dn - dark
         limit = self.camera.saturation_dn - dark
         if self.noise is not None and self.noise.full_well_e is not None:
             limit = min(limit, self.noise.full_well_e * gain)
-        clipped = found.clipped_share(self.camera.saturation_dn) > CLIPPED_LIMIT or signal > SATURATED_SHARE * limit
+        clipped = (
+            channel_mean.clipped_share(self.camera.saturation_dn) > CLIPPED_LIMIT or signal > SATURATED_SHARE * limit
+        )
         scale = 1.0 / (gain * capture.exposure_s)
         # The pixels differ by shot noise, read noise and PRNU
-        noise = found.mean_std_dn(self._step_dn)
+        noise = channel_mean.mean_std_dn(self._step_dn)
         std = float(np.sqrt(noise**2 + dark_std**2 + self.drift_dn.get(capture.id, 0.0) ** 2))
         return signal * scale, std * scale, clipped, signal / limit
 
@@ -245,8 +251,10 @@ class SpectralCaptures:
         weights = trapezoid_weights(self.wave)
         rates: dict[tuple[str, str], list[tuple[float, float, bool, float]]] = {}
         for capture in self.narrowband:
-            for channel, one in self._means(capture).items():
-                rates.setdefault((channel, self.path(capture)), []).append(self._electron_rate(capture, channel, one))
+            for channel, channel_mean in self._means(capture).items():
+                rates.setdefault((channel, self.path(capture)), []).append(
+                    self._electron_rate(capture, channel, channel_mean)
+                )
         result = {}
         for channel in phases(self.camera.cfa):
             good: list[tuple[FloatArray, float, float]] = []
@@ -255,8 +263,8 @@ class SpectralCaptures:
             for path, light in lights.items():
                 if not np.any(light > 0):
                     continue
-                found = rates[channel, path]
-                usable = [(rate, std) for rate, std, clipped, _ in found if not clipped]
+                captures_of_light = rates[channel, path]
+                usable = [(rate, std) for rate, std, clipped, _ in captures_of_light if not clipped]
                 if usable:
                     weight = 1.0 / np.array([std for _, std in usable]) ** 2
                     mean = float(np.sum(weight * [rate for rate, _ in usable]) / weight.sum())
@@ -265,16 +273,16 @@ class SpectralCaptures:
                     good.append((light * weights, mean, float(np.hypot(mean_std, RADIOMETER_STD * mean))))
                 else:
                     # A saturated mean is a lower limit, less 1 % for its noise
-                    high.append((light * weights, 0.99 * max(rate for rate, *_ in found)))
+                    high.append((light * weights, 0.99 * max(rate for rate, *_ in captures_of_light)))
             if len(good) < MIN_LIGHTS:
-                found_so_many = (
+                reason = (
                     f"only {len(good)} of {len(lights)} lights leave channel {channel} unsaturated, {MIN_LIGHTS} "
                     "needed: expose shorter"
                     if high
                     else f"{len(good)} different lights, {MIN_LIGHTS} needed: capture narrowband light over the "
                     "visible by 10 nm or finer"
                 )
-                raise NotDetermined("spectral", found_so_many)
+                raise NotDetermined("spectral", reason)
             if (different := different_spectra(np.array([g[0] for g in good]))) < MIN_LIGHTS:
                 raise NotDetermined(
                     "spectral",
@@ -301,24 +309,29 @@ class SpectralCaptures:
                 used.setdefault(flat.radiance, []).append(flat)
         for path, flats in used.items():
             for flat in flats:
-                for channel, one in self._means(flat).items():
-                    rate, std, clipped, share = self._electron_rate(flat, channel, one)
+                for channel, channel_mean in self._means(flat).items():
+                    rate, std, clipped, share = self._electron_rate(flat, channel, channel_mean)
                     if not clipped and FLAT_RANGE[0] < share < FLAT_RANGE[1]:
                         rates.setdefault((channel, path), []).append((rate, std))
         weights = trapezoid_weights(self.wave)
         result = {}
-        for channel, own in signals.items():
-            rows, values_, stds, seen = [own.operator], [own.value], [own.std], list(own.light)
+        for channel, narrowband in signals.items():
+            rows, values_, stds, seen = (
+                [narrowband.operator],
+                [narrowband.value],
+                [narrowband.std],
+                list(narrowband.light),
+            )
             for path in used:
-                found = rates.get((channel, path))
+                flat_rates = rates.get((channel, path))
                 spectrum = self.recordings.spectrum(path)
                 total = np.trapezoid(spectrum.value, spectrum.wavelength_nm)
                 inside = float(np.trapezoid(spectrum.at(self.wave), self.wave))
                 # Light beyond the narrowband range would count as light inside
-                if not found or inside < 0.95 * total:
+                if not flat_rates or inside < 0.95 * total:
                     continue
-                weight = 1.0 / np.array([std for _, std in found]) ** 2
-                mean = float(np.sum(weight * [rate for rate, _ in found]) / weight.sum())
+                weight = 1.0 / np.array([std for _, std in flat_rates]) ** 2
+                mean = float(np.sum(weight * [rate for rate, _ in flat_rates]) / weight.sum())
                 outside = 1.0 - inside / total
                 seen.append(path)
                 rows.append((self.photon_rate(path) * weights)[None])
@@ -329,8 +342,8 @@ class SpectralCaptures:
                 np.concatenate(values_),
                 np.concatenate(stds),
                 tuple(seen),
-                own.saturated,
-                own.limit,
+                narrowband.saturated,
+                narrowband.limit,
             )
         return result
 
@@ -415,12 +428,15 @@ def _result(
     """
     low, high = _span(captures)
     out = np.arange(np.ceil(low / OUTPUT_STEP_NM), np.floor(high / OUTPUT_STEP_NM) + 1) * OUTPUT_STEP_NM
-    known = {c: np.interp(out, captures.wave, found.determined.astype(float)) > 0.5 for c, found in solved.items()}
+    known = {
+        c: np.interp(out, captures.wave, sensitivity.determined.astype(float)) > 0.5
+        for c, sensitivity in solved.items()
+    }
     any_channel = np.flatnonzero(np.any(list(known.values()), axis=0))
     inside = slice(any_channel[0], any_channel[-1] + 1) if any_channel.size else slice(0, 0)
     out = out[inside]
-    highest = max(float(np.max(own.value / own.std)) for own in signals.values())
-    if highest < SEEN_SIGMA and not any(own.has_gaps for own in signals.values()):
+    highest = max(float(np.max(channel_signals.value / channel_signals.std)) for channel_signals in signals.values())
+    if highest < SEEN_SIGMA and not any(channel_signals.has_gaps for channel_signals in signals.values()):
         raise NotDetermined(
             "spectral",
             f"the captures show no light: the strongest signal is {highest:.1f} standard uncertainties above the "
@@ -447,8 +463,8 @@ def _result(
     # PRNU of the region differs between channels; the conversion gain is common
     prnu = (captures.noise.prnu_percent if captures.noise is not None else None) or 0.0
     for k, channel in enumerate(channels):
-        own = slice(k * out.size, (k + 1) * out.size)
-        joint[own, own] += (prnu / 100.0) ** 2 / captures.pixels[channel] * np.outer(value[own], value[own])
+        span = slice(k * out.size, (k + 1) * out.size)
+        joint[span, span] += (prnu / 100.0) ** 2 / captures.pixels[channel] * np.outer(value[span], value[span])
     absolute = np.sqrt(np.diag(joint) + (captures.gain_std / captures.gain * value) ** 2)
     peak = int(np.argmax(value))
     ratio = value / value[peak]

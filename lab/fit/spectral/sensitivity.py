@@ -57,18 +57,18 @@ DETERMINED_SHARE = 0.25  # of the maximum of the curve: largest standard deviati
 @dataclass(frozen=True)
 class Scatter:
     """Relative standard deviations of signals beyond the stated ones: `common` to the channels in one light, as the
-    lamp and the reading of its power are, and `own`, independent from channel to channel. `log_ratio`: ln of the
+    lamp and the reading of its power are, and `independent` from channel to channel. `log_ratio`: ln of the
     likelihood ratio to none.
     """
 
     common: float = 0.0
-    own: float = 0.0
+    independent: float = 0.0
     log_ratio: float = 0.0
 
     @property
     def total(self) -> float:
         """Return the relative standard deviation of one signal by both."""
-        return float(np.hypot(self.common, self.own))
+        return float(np.hypot(self.common, self.independent))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +106,13 @@ def light_errors(signals: Mapping[str, ChannelSignals]) -> dict[str, FloatArray]
     """Return the changes (n, lights) of each channel's signals by the relative errors of all lights, which the channels
     share.
     """
-    lights = np.array(list(dict.fromkeys(name for one in signals.values() for name in one.light)))
-    return {c: (np.array(one.light)[:, None] == lights) * one.value[:, None] for c, one in signals.items()}
+    lights = np.array(
+        list(dict.fromkeys(name for channel_signals in signals.values() for name in channel_signals.light))
+    )
+    return {
+        c: (np.array(channel_signals.light)[:, None] == lights) * channel_signals.value[:, None]
+        for c, channel_signals in signals.items()
+    }
 
 
 def joint_covariance(at: FloatArray, solved: Mapping[str, Sensitivity]) -> FloatArray:
@@ -116,8 +121,11 @@ def joint_covariance(at: FloatArray, solved: Mapping[str, Sensitivity]) -> Float
     """
     return np.block(
         [
-            [at @ (one.covariance if c == d else one.common @ two.common.T) @ at.T for d, two in solved.items()]
-            for c, one in solved.items()
+            [
+                at @ (first.covariance if c == d else first.common @ second.common.T) @ at.T
+                for d, second in solved.items()
+            ]
+            for c, first in solved.items()
         ]
     )
 
@@ -152,19 +160,19 @@ def scatter_evidence(
     light = np.concatenate([np.array(s.light) for s in signals])
     several = len(signals) > 1
     read = RADIOMETER_STD if several else 0.0  # part of the stated standard deviations, common to the channels
-    own = np.maximum(
+    variance = np.maximum(
         np.concatenate([s.std for s in signals]) ** 2 - (read * value) ** 2, 1e-20 * float(np.max(value**2))
     )
     y = turn.T @ value
-    noise = (turn.T * own) @ turn
+    noise = (turn.T * variance) @ turn
     alone = (turn.T * value**2) @ turn
     shared = turn.T @ ((light[:, None] == light) * np.outer(value, value)) @ turn if several else alone
     curve = [r.T @ p @ r for r, p in zip(rest, prior, strict=True)]
     ends = np.cumsum([0, *(len(c) for c in curve)])
     count = len(signals)
 
-    def loss(strength: FloatArray, found: Scatter) -> float:
-        covariance = noise + (read**2 + found.common**2) * shared + found.own**2 * alone
+    def loss(strength: FloatArray, trial: Scatter) -> float:
+        covariance = noise + (read**2 + trial.common**2) * shared + trial.independent**2 * alone
         for k in range(count):
             at = slice(ends[k], ends[k + 1])
             covariance[at, at] += np.exp(strength[k]) * curve[k]
@@ -175,34 +183,34 @@ def scatter_evidence(
         z = linalg.solve_triangular(root, y, lower=True, check_finite=False)
         return 0.5 * float(z @ z) + float(np.log(np.diag(root)).sum())
 
-    def penalised(x: FloatArray) -> float:
+    def penalise(x: FloatArray) -> float:
         weak = 0.5 * float(np.sum(((x[count:] - _PRIOR_LOG) / _PRIOR_STD) ** 2))
         return loss(x[:count], _scatter_of(x[count:])) + weak
 
     without, _ = _least(lambda x: loss(x, Scatter()), start)
-    first = [max(scatter.common, 0.003), *([max(scatter.own, 0.001)] if several else [])]
-    _, x = _least(penalised, np.concatenate([start, np.log(first)]))
-    found = _scatter_of(x[count:])
-    log_evidence = -loss(x[:count], found)
-    return ScatterEvidence(log_evidence, replace(found, log_ratio=log_evidence + without), x[:count])
+    first = [max(scatter.common, 0.003), *([max(scatter.independent, 0.001)] if several else [])]
+    _, x = _least(penalise, np.concatenate([start, np.log(first)]))
+    likeliest = _scatter_of(x[count:])
+    log_evidence = -loss(x[:count], likeliest)
+    return ScatterEvidence(log_evidence, replace(likeliest, log_ratio=log_evidence + without), x[:count])
 
 
 def _scatter_of(log: FloatArray) -> Scatter:
-    """Return the scatter of the logarithms of `common` and `own`."""
+    """Return the scatter of the logarithms of `common` and `independent`."""
     return Scatter(*np.exp(np.minimum(log, np.log(MOST_SCATTER))).tolist())
 
 
 def _least(loss: Callable[[FloatArray], float], start: FloatArray) -> tuple[float, FloatArray]:
     """Minimise `loss` by a simplex about `start`. Returns the least value and its place."""
     simplex = np.concatenate([start[None], start + np.eye(start.size)])
-    found = optimize.minimize(
+    minimum = optimize.minimize(
         loss,
         start,
         method="Nelder-Mead",
         bounds=[(x - _STRENGTH_RANGE, x + _STRENGTH_RANGE) for x in start],
         options={"xatol": 0.05, "fatol": 0.05, "initial_simplex": simplex},
     )
-    return float(found.fun), np.asarray(found.x)
+    return float(minimum.fun), np.asarray(minimum.x)
 
 
 def scatter_remarks(scatter: Scatter) -> list[str]:
@@ -211,7 +219,7 @@ def scatter_remarks(scatter: Scatter) -> list[str]:
         return []
     shares = [
         f"{100.0 * part:.2g} % {whose}"
-        for part, whose in ((scatter.common, "common to the channels"), (scatter.own, "of each channel's own"))
+        for part, whose in ((scatter.common, "common to the channels"), (scatter.independent, "of each channel's own"))
         if part > 0.1 * scatter.total
     ]
     return [
@@ -248,18 +256,31 @@ def estimate_sensitivity(
 ) -> Sensitivity:
     """Estimate the sensitivity S(w) from signals C_i = integral L_i(w) S(w) dw + noise.
 
-    `wavelength_nm` (m,), ascending; `lights` (n, m), photons (or power) per nm; `signal`, `signal_std` (n,). S is in
-    signal per photon (or energy), on `wavelength_nm`; integrals are by the trapezoidal rule. Where no light shines,
-    `std` is large and `determined` False. Raises ValueError where shapes don't fit, values aren't finite, a light is
-    negative by more than noise, a standard deviation isn't above 0, or fewer than 3 lights differ. The method:
-    `lab.fit.spectral`.
+    wavelength_nm : (m,), ascending; integrals are by the trapezoidal rule
+    lights : (n, m), photons (or power) per nm
+    signal, signal_std : (n,)
+
+    Returns S in signal per photon (or energy) on `wavelength_nm`; where no light shines, its `std` is large and
+    `determined` False. Raises ValueError where shapes don't fit, values aren't finite, a light is negative by more than
+    noise, a standard deviation isn't above 0, or fewer than 3 lights differ. The method: `lab.fit.spectral`.
+
+    >>> import calibench
+    >>> import numpy as np
+    >>> wavelength_nm = np.arange(400.0, 701.0, 5.0)
+    >>> truth = 0.6 * np.exp(-0.5 * ((wavelength_nm - 550.0) / 40.0) ** 2)
+    >>> centres_nm = np.arange(400.0, 701.0, 10.0)
+    >>> lights = 1e6 * np.exp(-0.5 * ((wavelength_nm - centres_nm[:, None]) / 5.0) ** 2)
+    >>> signal = np.trapezoid(lights * truth, wavelength_nm, axis=1)
+    >>> estimate = calibench.estimate_sensitivity(wavelength_nm, lights, signal, np.full(31, 1e3))
+    >>> bool(np.abs(estimate.sensitivity - truth).max() < 0.02)
+    True
     """
     wave, light, value, std = (np.asarray(a, float) for a in (wavelength_nm, lights, signal, signal_std))
     _refuse_unusable(wave, light, value, std)
     names = tuple(str(k) for k in range(value.size))
     none = np.zeros((0, wave.size)), np.zeros(0)
-    one = ChannelSignals(light * trapezoid_weights(wave), value, std, names, *none)
-    return solve_sensitivities(wave, {"": one})[0][""]
+    single_channel = ChannelSignals(light * trapezoid_weights(wave), value, std, names, *none)
+    return solve_sensitivities(wave, {"": single_channel})[0][""]
 
 
 def _refuse_unusable(wave: FloatArray, light: FloatArray, value: FloatArray, std: FloatArray) -> None:
@@ -291,17 +312,28 @@ def _refuse_unusable(wave: FloatArray, light: FloatArray, value: FloatArray, std
 
 
 def different_spectra(light: FloatArray) -> int:
-    """Count the spectra (n, wavelengths) that differ by more than the repeatability of the radiometer.
+    """Count the spectra that differ by more than the repeatability of the radiometer.
 
-    It is the number of singular values of the normalised lights above it. A light taken twice, or at two levels,
-    counts once.
+    light : (n, wavelengths)
+
+    It is the number of singular values of the normalised lights above it. A light taken twice, or at two levels, counts
+    once.
+
+    >>> different_spectra(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 2.0, 0.0]]))
+    2
     """
     unit = light / np.linalg.norm(light, axis=1, keepdims=True)
     return int(np.sum(np.linalg.svd(unit, compute_uv=False) > np.sqrt(2.0) * RADIOMETER_STD))
 
 
 def trapezoid_weights(wave: FloatArray) -> FloatArray:
-    """Return the weights (m,) of the trapezoidal rule."""
+    """Return the weights (m,) of the trapezoidal rule.
+
+    wave : places (m,), ascending
+
+    >>> trapezoid_weights(np.array([400.0, 410.0, 430.0])).tolist()
+    [5.0, 15.0, 10.0]
+    """
     half = np.diff(wave) / 2.0
     return np.append(half, 0.0) + np.append(0.0, half)
 
@@ -340,10 +372,12 @@ def solve_sensitivities(
     errors = light_errors(signals)
     curves = {}
     for c, prior in priors.items():
-        own = signals[c].with_scatter(scatter)
-        one = posterior_under_prior(wave, own.operator, own.value, own.std, prior)
-        common = RADIOMETER_STD * one.gain @ errors[c]
-        curves[c] = _within(wave, own, one.mean, one.covariance, common)
+        channel_signals = signals[c].with_scatter(scatter)
+        posterior = posterior_under_prior(
+            wave, channel_signals.operator, channel_signals.value, channel_signals.std, prior
+        )
+        common = RADIOMETER_STD * posterior.gain @ errors[c]
+        curves[c] = _within(wave, channel_signals, posterior.mean, posterior.covariance, common)
     return curves, scatter
 
 
@@ -357,18 +391,31 @@ def _solve_together(
     lights; G_c: curve by signals.
     """
     errors = light_errors(signals)
-    own = {c: s.without_shared_error(Scatter(own=scatter.own)) for c, s in signals.items()}
-    found = {c: posterior_under_prior(wave, s.operator, s.value, s.std, priors[c]) for c, s in own.items()}
+    independent_signals = {
+        c: s.without_shared_error(Scatter(independent=scatter.independent)) for c, s in signals.items()
+    }
+    posteriors = {
+        c: posterior_under_prior(wave, s.operator, s.value, s.std, priors[c]) for c, s in independent_signals.items()
+    }
     shared = float(np.hypot(RADIOMETER_STD, scatter.common))
-    precision = np.sum([errors[c].T @ one.precision @ errors[c] for c, one in found.items()], axis=0)
+    precision = np.sum([errors[c].T @ posterior.precision @ errors[c] for c, posterior in posteriors.items()], axis=0)
     covariance = np.linalg.inv(precision + np.eye(len(precision)) / shared**2)
-    error = covariance @ np.sum([errors[c].T @ one.precision @ own[c].value for c, one in found.items()], axis=0)
+    error = covariance @ np.sum(
+        [errors[c].T @ posterior.precision @ independent_signals[c].value for c, posterior in posteriors.items()],
+        axis=0,
+    )
     root = np.linalg.cholesky(covariance)
     curves = {}
-    for c, one in found.items():
-        moved = one.gain @ errors[c]
+    for c, posterior in posteriors.items():
+        moved = posterior.gain @ errors[c]
         common = moved @ root
-        curves[c] = _within(wave, own[c], one.mean - moved @ error, one.covariance + common @ common.T, common)
+        curves[c] = _within(
+            wave,
+            independent_signals[c],
+            posterior.mean - moved @ error,
+            posterior.covariance + common @ common.T,
+            common,
+        )
     return curves
 
 

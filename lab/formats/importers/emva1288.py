@@ -22,9 +22,9 @@ import numpy as np
 
 from lab.errors import InputError
 from lab.formats.cgats import read_foreign_text
-from lab.formats.importers.images import ImageFiles, described_sides, read_camera_file, read_image
+from lab.formats.importers.images import ImageFiles, read_camera_file, read_image, read_sides
 from lab.formats.importers.own_statements import compare_with_files
-from lab.formats.importers.stated_settings import held_against_frames
+from lab.formats.importers.stated_settings import check_against_frames
 from lab.formats.pictures import IMAGES, TIFFS, picture_facts
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.recording_set.manifest import without_common_photons
@@ -57,39 +57,48 @@ class ImageDescriptor:
 
 
 def parse_descriptor(text: str) -> ImageDescriptor:
-    """Return the descriptor in `text`; InputError with `line N: ...` where a line can't be understood."""
-    found = ImageDescriptor()
-    other: Counter[str] = Counter()
+    r"""Return the descriptor of an EMVA 1288 data set.
+
+    text : lines `v` release, `n` bits width height, `b` exposure (ns) photons, `d` exposure (ns), `i` image
+
+    Raises InputError with `line N: ...` where a line can't be understood.
+
+    >>> descriptor = parse_descriptor("n 12 640 480\nb 1000000 250.0\ni flat1.tif\ni flat2.tif\n")
+    >>> descriptor.bits, descriptor.levels[0].exposure_s, descriptor.levels[0].images
+    (12, 0.001, ['flat1.tif', 'flat2.tif'])
+    """
+    descriptor = ImageDescriptor()
+    unused: Counter[str] = Counter()
     for number, line in enumerate(text.removeprefix("\ufeff").splitlines(), start=1):
         words = line.split("#")[0].split() if line.lstrip()[:1] != "i" else line.split()
         if not words or words[0].startswith("#"):
             continue
         key, rest = words[0].lower(), words[1:]
         if key == "v":
-            found.release = " ".join(rest) or None
+            descriptor.release = " ".join(rest) or None
         elif key == "n":
-            bits, found.width, found.height = (
+            bits, descriptor.width, descriptor.height = (
                 int(value) for value in _numbers(rest, 3, number, "bits, width and height")[:3]
             )
-            found.bits = bits
+            descriptor.bits = bits
             if not 1 <= bits <= 16:
                 raise InputError(f"line {number}: {bits} bits; frames have 1 to 16: correct it")
         elif key == "b":
             exposure_ns, *photons = _numbers(rest, 1, number, "exposure (ns) and photons a pixel")
-            found.levels.append(DescribedLevel(True, exposure_ns * NS, photons[0] if photons else None, number))
+            descriptor.levels.append(DescribedLevel(True, exposure_ns * NS, photons[0] if photons else None, number))
             if len(photons) > 1:
-                other["further numbers in a line 'b'"] += 1
+                unused["further numbers in a line 'b'"] += 1
         elif key == "d":
             exposure_ns, *_ = _numbers(rest, 1, number, "exposure (ns)")
-            found.levels.append(DescribedLevel(False, exposure_ns * NS, None, number))
+            descriptor.levels.append(DescribedLevel(False, exposure_ns * NS, None, number))
         elif key == "i":
-            if not found.levels:
+            if not descriptor.levels:
                 raise InputError(f"line {number}: an image before the first level; put a line 'b' or 'd' before it")
-            found.levels[-1].images.append(line.strip()[1:].strip().strip('"'))
+            descriptor.levels[-1].images.append(line.strip()[1:].strip().strip('"'))
         else:
-            other[f"'{key}'"] += 1
-    found.remarks += [f"{count} lines with {name} are not used" for name, count in other.items()]
-    return found
+            unused[f"'{key}'"] += 1
+    descriptor.remarks += [f"{count} lines with {name} are not used" for name, count in unused.items()]
+    return descriptor
 
 
 def _numbers(words: list[str], least: int, line: int, what: str) -> list[float]:
@@ -122,12 +131,12 @@ def find_descriptor(path: Path) -> Path:
         return bool(re.search(r"^\s*[bd]\s+[\d.]", text, re.M | re.I) and re.search(r"^\s*i\s+\S", text, re.M | re.I))
 
     for pattern in ("*", "*/*"):
-        found = sorted(file for file in path.glob(pattern) if is_descriptor(file))
-        if len(found) == 1:
-            return found[0]
-        if found:
-            names = ", ".join(file.name for file in found)
-            raise InputError(f"{path}: {len(found)} descriptor files ({names}); give the one that counts")
+        descriptors = sorted(file for file in path.glob(pattern) if is_descriptor(file))
+        if len(descriptors) == 1:
+            return descriptors[0]
+        if descriptors:
+            names = ", ".join(file.name for file in descriptors)
+            raise InputError(f"{path}: {len(descriptors)} descriptor files ({names}); give the one that counts")
     raise InputError(f"{path}: no EMVA 1288 descriptor (a text file with lines 'n', 'b', 'd', 'i'); give its folder")
 
 
@@ -158,15 +167,15 @@ def read_emva1288(path: Path) -> RecordingSet:
     """
     file = find_descriptor(path)
     try:
-        found = read_foreign_text(file)
-        descriptor = parse_descriptor(found.text)
+        text = read_foreign_text(file)
+        descriptor = parse_descriptor(text.text)
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
     images = _Images(file.parent)
-    warnings = [f"{file}: {remark}" for remark in (*found.remarks, *descriptor.remarks)]
+    warnings = [f"{file}: {remark}" for remark in (*text.remarks, *descriptor.remarks)]
     listed = [(level, name, images.find(name)) for level in descriptor.levels for name in level.images]
-    there = [(level, name, found) for level, name, found in listed if found is not None]
-    missing = [name for _, name, found in listed if found is None]
+    there = [(level, name, image) for level, name, image in listed if image is not None]
+    missing = [name for _, name, image in listed if image is None]
     if not there:
         raise InputError(f"{file}: none of its {len(listed)} images is there; put them where it says, beside it")
     if missing:
@@ -176,7 +185,9 @@ def read_emva1288(path: Path) -> RecordingSet:
         )
     captures, frames, pages, remarks = _captures(there)
     warnings += [f"{file}: {remark}" for remark in remarks]
-    brightest = max(captures, key=lambda one: (one.get("photons_per_pixel") or 0.0, one["exposure_s"]))["frame"]
+    brightest = max(captures, key=lambda capture: (capture.get("photons_per_pixel") or 0.0, capture["exposure_s"]))[
+        "frame"
+    ]
     first = [(frames[path], pages.get(path)) for path in dict.fromkeys((captures[0]["frame"], brightest))]
     shape, shift = _shape_and_shift(first, descriptor, file, warnings)
     cameras = read_camera_file(
@@ -213,9 +224,9 @@ def read_emva1288(path: Path) -> RecordingSet:
         }
     )
     manifest, warnings = without_common_photons(manifest, str(file), warnings)
-    manifest, said = held_against_frames(manifest, frames, str(file))
+    manifest, said = check_against_frames(manifest, frames, str(file))
     warnings += said
-    stated = {**described_sides(file.parent / "camera.toml")["left"]}
+    stated = {**read_sides(file.parent / "camera.toml")["left"]}
     if descriptor.bits is not None:
         stated["bit_depth"] = descriptor.bits
     warnings += compare_with_files(camera, stated, frames.values())
@@ -266,15 +277,15 @@ def _captures(
     pages: dict[str, int] = {}
     stacks: list[str] = []
     used: Counter[str] = Counter()
-    for level, _, found in there:
+    for level, _, image in there:
         try:
-            many = picture_facts(found).pages if found.suffix.lower() in TIFFS else 1
+            many = picture_facts(image).pages if image.suffix.lower() in TIFFS else 1
         except InputError as error:
-            raise InputError(f"{found}: {error}") from error
+            raise InputError(f"{image}: {error}") from error
         if many > 1:
-            stacks.append(f"{found.name} ({many})")
+            stacks.append(f"{image.name} ({many})")
         for page in range(many):
-            stem = re.sub(r"[^\w.-]+", "_", found.stem) + ("" if many == 1 else f"-p{page + 1}")
+            stem = re.sub(r"[^\w.-]+", "_", image.stem) + ("" if many == 1 else f"-p{page + 1}")
             used[stem] += 1
             id = stem if used[stem] == 1 else f"{stem}-{used[stem]}"
             path = f"frames/{id}.npy"
@@ -288,7 +299,7 @@ def _captures(
             if level.bright:
                 capture["photons_per_pixel"] = level.photons_per_pixel
             captures.append(capture)
-            frames[path] = found
+            frames[path] = image
             if many > 1:
                 pages[path] = page
     more = f" and {len(stacks) - 3} more" if len(stacks) > 3 else ""

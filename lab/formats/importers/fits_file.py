@@ -94,7 +94,11 @@ def is_fits(file: Path) -> bool:
 
 
 def unpacked_name(name: str) -> str:
-    """Return the name of a FITS file without the ending of its packing; other names as they are."""
+    """Return the name of a FITS file without the ending of its packing; other names as they are.
+
+    >>> unpacked_name("flat-1.fits.gz"), unpacked_name("notes.gz")
+    ('flat-1.fits', 'notes.gz')
+    """
     inner = name[: -len(PACKED[0])] if name.lower().endswith(PACKED) else name
     return inner if inner.lower().endswith(FITS) else name
 
@@ -102,33 +106,33 @@ def unpacked_name(name: str) -> str:
 def load_fits(file: Path, plane: int | None = None) -> Frame:
     """Return the only frame of a FITS file, or that `plane` of a cube, uint16 (rows, cols) with BZERO and BSCALE
     applied. InputError without the path."""
-    values, _ = _opened(file)
+    values, _ = _read_image(file)
     planes = _planes(values.shape)
     if planes > 1 and plane is None:
         raise InputError(f"holds {planes} frames, not 1; give a folder of frames, or save one file a frame")
-    found = values.reshape(planes, *values.shape[-2:])[plane or 0]
-    if found.dtype.kind not in "iu" and not np.array_equal(found, np.rint(found)):
-        raise InputError(f"its values are {found.dtype} with fractions; save raw DN as integers")
-    if found.size and (found.min() < 0 or found.max() > np.iinfo(np.uint16).max):
+    frame = values.reshape(planes, *values.shape[-2:])[plane or 0]
+    if frame.dtype.kind not in "iu" and not np.array_equal(frame, np.rint(frame)):
+        raise InputError(f"its values are {frame.dtype} with fractions; save raw DN as integers")
+    if frame.size and (frame.min() < 0 or frame.max() > np.iinfo(np.uint16).max):
         raise InputError(
-            f"its values are {found.min():g} .. {found.max():g}; raw DN are 0 .. 65535: save them unscaled"
+            f"its values are {frame.min():g} .. {frame.max():g}; raw DN are 0 .. 65535: save them unscaled"
         )
-    return np.ascontiguousarray(found, dtype=np.uint16)
+    return np.ascontiguousarray(frame, dtype=np.uint16)
 
 
 def fits_header(file: Path, *, with_image: bool = True, ignored: Collection[str] = ()) -> FitsHeader:
     """Return what the header says; InputError without the path. Without `with_image`, the image isn't read, and damage
     in it stays unseen. `ignored`: keywords that count as not there."""
-    header = (_opened(file)[1] if with_image else _header(file)).copy()
+    header = (_read_image(file)[1] if with_image else _header(file)).copy()
     for keyword in ignored:
         header.remove(keyword, ignore_missing=True, remove_all=True)
-    found = _Reading(header)
-    exposure_s = found.exposure_s()
-    temperature_c = found.temperature_c()
-    time = found.time()
+    fields = _Reading(header)
+    exposure_s = fields.exposure_s()
+    temperature_c = fields.temperature_c()
+    time = fields.time()
     cfa = _cfa(header)
     if header.get("BSCALE", 1) != 1:
-        found.remarks.append(f"BSCALE = {header['BSCALE']:g}: codes are multiples of it")
+        fields.remarks.append(f"BSCALE = {header['BSCALE']:g}: codes are multiples of it")
     stated = next((str(header[key]).strip() for key in IMAGE_TYPE_KEYS if _kind_of(header.get(key))), None)
     written = next((str(header[key]).strip() for key in IMAGE_TYPE_KEYS[:-1] if header.get(key) is not None), None)
     stacked = next((f"{key} = {header[key]}" for key in STACKED_KEYS if _is_above_one(header.get(key))), None)
@@ -146,8 +150,8 @@ def fits_header(file: Path, *, with_image: bool = True, ignored: Collection[str]
         mosaic_source="" if cfa is None else _mosaic_source(header),
         pixel_pitch_um=_pitch_um(header),
         settings=_settings(header),
-        problems=tuple(found.problems),
-        remarks=tuple(found.remarks),
+        problems=tuple(fields.problems),
+        remarks=tuple(fields.remarks),
     )
 
 
@@ -173,7 +177,7 @@ def _stream(file: Path) -> Iterator[IO[bytes]]:
     yield held
 
 
-def _joined(first: Any, image: Any) -> Any:
+def _join_headers(first: Any, image: Any) -> Any:
     """Return the header of an image with what that of the file's beginning adds to it."""
     if image is first:
         return image.header
@@ -192,14 +196,14 @@ def _header(file: Path) -> Any:
             with _stream(file) as stream, fits.open(stream, memmap=False, lazy_load_hdus=True) as opened:
                 first = opened[0]
                 image = next((hdu for hdu in opened if getattr(hdu, "is_image", False) and hdu.header["NAXIS"]), first)
-                return _joined(first, image)
+                return _join_headers(first, image)
         except InputError:
             raise
         except Exception as error:
             raise InputError(f"damaged FITS ({one_line(error)}); copy it again or recapture") from error
 
 
-def _opened(file: Path) -> tuple[NDArray[Any], Any]:
+def _read_image(file: Path) -> tuple[NDArray[Any], Any]:
     """Return the image's values and header. A file whose data or checksum is damaged is refused."""
     from astropy.io import fits
     from astropy.io.fits.verify import VerifyWarning
@@ -212,20 +216,20 @@ def _opened(file: Path) -> tuple[NDArray[Any], Any]:
             with _stream(file) as stream, fits.open(stream, memmap=False, checksum=True) as opened:
                 images = [hdu for hdu in opened if getattr(hdu, "is_image", False) and hdu.data is not None]
                 names = [hdu.name or f"extension {opened.index_of(hdu)}" for hdu in images]
-                found = [(np.asarray(hdu.data), _joined(opened[0], hdu)) for hdu in images]
+                values_and_headers = [(np.asarray(hdu.data), _join_headers(opened[0], hdu)) for hdu in images]
         except InputError:
             raise
         except Exception as error:
             raise InputError(f"damaged FITS ({one_line(error)}); copy it again or recapture") from error
-    if not found:
+    if not values_and_headers:
         raise InputError("holds no image; save one image a file")
-    if len(found) > 1:
+    if len(values_and_headers) > 1:
         raise InputError(
-            f"holds {len(found)} images, not 1 ({', '.join(names)}); where they are the outputs of one sensor, join "
-            "them to one image and describe them by [[taps]] in camera.toml; where they are frames, save one file a "
-            "frame"
+            f"holds {len(values_and_headers)} images, not 1 ({', '.join(names)}); where they are the outputs of one "
+            "sensor, join them to one image and describe them by [[taps]] in camera.toml; where they are frames, save "
+            "one file a frame"
         )
-    return found[0]
+    return values_and_headers[0]
 
 
 def _planes(shape: tuple[int, ...]) -> int:
@@ -288,8 +292,8 @@ def _settings(header: Any) -> dict[str, Value]:
 
 
 def _pitch_um(header: Any) -> float | None:
-    found = {number for key in PITCH_KEYS if (number := _float(header.get(key)))}
-    return found.pop() if len(found) == 1 else None
+    pitches_um = {number for key in PITCH_KEYS if (number := _float(header.get(key)))}
+    return pitches_um.pop() if len(pitches_um) == 1 else None
 
 
 def _cfa(header: Any) -> Cfa | None:
@@ -328,25 +332,25 @@ class _Reading:
         self.remarks: list[str] = []
 
     def exposure_s(self) -> float | None:
-        found: dict[str, float] = {}
+        stated_s: dict[str, float] = {}
         for key in EXPOSURE_KEYS:
             if self.header.get(key) is not None:
                 seconds = self._seconds(key)
                 if seconds is None:
                     return None
-                found[key] = seconds
-        if not found and (us := _float(self.header.get(EXPOSURE_US_KEY))) is not None:
+                stated_s[key] = seconds
+        if not stated_s and (us := _float(self.header.get(EXPOSURE_US_KEY))) is not None:
             self.remarks.append(f"{EXPOSURE_US_KEY} = {us:g} is in us by its name: read as {us / 1e6:g} s")
             return us / 1e6
-        if len(found) > 1 and np.ptp(list(found.values())) > SAME_EXPOSURE * max(found.values()):
-            listed = ", ".join(f"{key} = {value:g} s" for key, value in found.items())
+        if len(stated_s) > 1 and np.ptp(list(stated_s.values())) > SAME_EXPOSURE * max(stated_s.values()):
+            listed = ", ".join(f"{key} = {value:g} s" for key, value in stated_s.items())
             line = (
                 f"its header states two exposures ({listed}); write exposure_s into index.csv, or ignore one, "
-                f"--ignore {list(found)[-1]}"
+                f"--ignore {list(stated_s)[-1]}"
             )
             self.problems.append(("exposure_s", line))
             return None
-        return next(iter(found.values()), None)
+        return next(iter(stated_s.values()), None)
 
     def _seconds(self, key: str) -> float | None:
         value, comment = self.header[key], str(self.header.comments[key])

@@ -29,7 +29,7 @@ def read_fits_folder(path: Path, tap: str = "", choice: HeaderChoice = ALL_FRAME
     """
     if (path / INDEX).is_file():
         return recordings_of_index(path, _with_headers(path, choice), str(path / INDEX), tap, choice)
-    files, remarks = _listed(path)
+    files, remarks = _list_files(path)
     rows: list[tuple[int, dict[str, str]]] = []
     problems: list[tuple[Path | str, str]] = []
     left_out: dict[str, list[str]] = {}
@@ -66,16 +66,16 @@ def read_fits_folder(path: Path, tap: str = "", choice: HeaderChoice = ALL_FRAME
     return recordings
 
 
-def _listed(path: Path) -> tuple[list[Path], list[str]]:
+def _list_files(path: Path) -> tuple[list[Path], list[str]]:
     """Return the FITS files of a folder, or where it has none those of its subfolders, and what is to be told of
     subfolders. Raises InputError where there are none."""
     files = sorted(file for file in path.iterdir() if is_fits(file))
     inner = sorted(file for file in path.rglob("*") if file.parent != path and is_fits(file) and file.is_file())
-    found = Counter(file.parent.relative_to(path).as_posix() for file in inner)
-    folders = ", ".join(f"{name} ({number})" for name, number in found.items())
+    frames_of_folder = Counter(file.parent.relative_to(path).as_posix() for file in inner)
+    folders = ", ".join(f"{name} ({number})" for name, number in frames_of_folder.items())
     if files:
-        told = f"{path}: frames in its subfolders are left out: {folders}; move them here, or write {INDEX}"
-        return files, [told] if inner else []
+        remark = f"{path}: frames in its subfolders are left out: {folders}; move them here, or write {INDEX}"
+        return files, [remark] if inner else []
     if not inner:
         raise InputError(
             f"{path}: no FITS frames ({', '.join(FITS)}, also with {', '.join(PACKED)}); give their folder"

@@ -81,7 +81,12 @@ OTHER_PARTS = ("WIND", "GUIDE", "MOTOR", "SLEW")
 
 
 def setting_of(keyword: str) -> FrameSetting | None:
-    """Return the setting that a keyword states, by the list or by a part of its name; None where it states none."""
+    """Return the setting that a header's keyword states, by the list or by a part of its name; None where it states
+    none.
+
+    >>> setting_of("GAIN").keywords[0], setting_of("OBSERVER")
+    ('GAIN', None)
+    """
     if keyword in KEYWORDS:
         return KEYWORDS[keyword]
     name = keyword.upper()
@@ -91,15 +96,27 @@ def setting_of(keyword: str) -> FrameSetting | None:
 
 
 def text_of(value: Value) -> str:
-    """Return a setting's value as it is written."""
+    """Return a setting's value as it is written; whole numbers without a decimal point.
+
+    >>> text_of(100.0), text_of("HIGH")
+    ('100', 'HIGH')
+    """
     return value if isinstance(value, str) else f"{value:.6g}"
 
 
-def is_same(keyword: str, one: Value, other: Value) -> bool:
-    """Return whether two values of a keyword are one setting."""
-    if isinstance(one, str) or isinstance(other, str):
-        return text_of(one).casefold() == text_of(other).casefold()
-    low, high = sorted((one, other))
+def is_same(keyword: str, first: Value, second: Value) -> bool:
+    """Return whether two values of a keyword are one setting: equal, of texts but for case, or within the setting's
+    factor.
+
+    keyword : of the header
+    first, second : numbers or texts
+
+    >>> is_same("READMODE", "Low noise", "LOW NOISE"), is_same("GAIN", 100.0, 200.0)
+    (True, False)
+    """
+    if isinstance(first, str) or isinstance(second, str):
+        return text_of(first).casefold() == text_of(second).casefold()
+    low, high = sorted((first, second))
     setting = setting_of(keyword)
     return low == high or (setting is not None and low > 0 and high <= low * setting.factor)
 
@@ -121,20 +138,20 @@ def compare_settings(frames: Sequence[StatedFrame], where: str) -> tuple[list[st
     problems: list[str] = []
     warnings: list[str] = []
     for side in dict.fromkeys(frame.capture.side for frame in frames):
-        own = [frame for frame in frames if frame.capture.side == side]
+        frames_of_side = [frame for frame in frames if frame.capture.side == side]
         for setting in SETTINGS:
-            line, is_problem = _first_difference(setting, own, where)
+            line, is_problem = _first_difference(setting, frames_of_side, where)
             if line:
                 (problems if is_problem else warnings).append(line)
-        warnings += [*_unstated(own, where), *_unlisted(own, where)]
+        warnings += [*_unstated(frames_of_side, where), *_unlisted(frames_of_side, where)]
     return problems, warnings
 
 
-def _first_difference(setting: FrameSetting, own: Sequence[StatedFrame], where: str) -> tuple[str, bool]:
+def _first_difference(setting: FrameSetting, frames_of_side: Sequence[StatedFrame], where: str) -> tuple[str, bool]:
     """Return the line for the first keyword of a setting that differs within a group of frames, and whether it is a
     problem; an empty line where none does."""
     for keyword in setting.keywords:
-        for group in _groups(setting, own):
+        for group in _groups(setting, frames_of_side):
             fitted = [frame for frame in group if _is_bound(setting, frame)]
             for frames in (fitted, group):
                 values = _values(keyword, frames)
@@ -143,17 +160,18 @@ def _first_difference(setting: FrameSetting, own: Sequence[StatedFrame], where: 
     return "", False
 
 
-def _unlisted(own: Sequence[StatedFrame], where: str) -> Iterator[str]:
+def _unlisted(frames_of_side: Sequence[StatedFrame], where: str) -> Iterator[str]:
     """Yield a line for each keyword that isn't listed, seems to be a setting by its name, and differs within a group of
     frames. Where each frame has a value of its own, it is a measurement."""
-    for keyword in dict.fromkeys(key for frame in own for key in frame.settings if key not in KEYWORDS):
+    for keyword in dict.fromkeys(key for frame in frames_of_side for key in frame.settings if key not in KEYWORDS):
         setting = setting_of(keyword)
-        for group in _groups(setting, own) if setting is not None else ():
+        for group in _groups(setting, frames_of_side) if setting is not None else ():
             values = _values(keyword, group)
             if 1 < len(values) < sum(map(len, values.values())):
                 yield (
-                    f"{where}: {keyword} differs between frames that are fitted together: {_listed(values)}; where it "
-                    f"is a setting of the camera, import one group, --only {keyword}={text_of(next(iter(values)))}"
+                    f"{where}: {keyword} differs between frames that are fitted together: {_format_values(values)}; "
+                    f"where it is a setting of the camera, import one group, "
+                    f"--only {keyword}={text_of(next(iter(values)))}"
                 )
                 break
 
@@ -163,14 +181,14 @@ def _is_bound(setting: FrameSetting, frame: StatedFrame) -> bool:
     return setting.changes not in (SharedBy.CODES, SharedBy.LIGHT) or frame.capture.codes_are_fitted
 
 
-def _groups(setting: FrameSetting, own: Sequence[StatedFrame]) -> list[list[StatedFrame]]:
+def _groups(setting: FrameSetting, frames_of_side: Sequence[StatedFrame]) -> list[list[StatedFrame]]:
     """Return the frames of one side that have to share a setting, in groups."""
     keys: dict[SharedBy, Callable[[Capture], object]] = {
         SharedBy.CODES: lambda capture: round(capture.gain_db or 0.0, 6),
         SharedBy.LIGHT: _light,
     }
     groups: dict[object, list[StatedFrame]] = {}
-    for frame in own:
+    for frame in frames_of_side:
         is_dark = isinstance(frame.capture, DarkCapture)
         if is_dark and setting.changes in (SharedBy.LIGHT, SharedBy.VIEW):
             continue
@@ -190,19 +208,19 @@ def _light(capture: Capture) -> object:
 
 def _values(keyword: str, frames: Sequence[StatedFrame]) -> dict[Value, list[StatedFrame]]:
     """Return the frames by the value that they state, that of most frames first."""
-    found: dict[Value, list[StatedFrame]] = {}
+    frames_of_value: dict[Value, list[StatedFrame]] = {}
     for frame in frames:
         value = frame.settings.get(keyword)
         if value is not None:
-            first = next((other for other in found if is_same(keyword, other, value)), value)
-            found.setdefault(first, []).append(frame)
-    return dict(sorted(found.items(), key=lambda item: -len(item[1])))
+            first = next((known for known in frames_of_value if is_same(keyword, known, value)), value)
+            frames_of_value.setdefault(first, []).append(frame)
+    return dict(sorted(frames_of_value.items(), key=lambda item: -len(item[1])))
 
 
 def _difference(
     setting: FrameSetting, keyword: str, values: Mapping[Value, Sequence[StatedFrame]], where: str, is_problem: bool
 ) -> str:
-    listed = _listed(values)
+    listed = _format_values(values)
     if not is_problem:
         return (
             f"{where}: {keyword} ({setting.name}) differs between frames: {listed}; each is fitted by itself, and all "
@@ -219,21 +237,21 @@ def _difference(
     )
 
 
-def _listed(values: Mapping[Value, Sequence[StatedFrame]]) -> str:
-    return ", ".join(f"{text_of(value)} in {_named(frames)}" for value, frames in values.items())
+def _format_values(values: Mapping[Value, Sequence[StatedFrame]]) -> str:
+    return ", ".join(f"{text_of(value)} in {_name_frames(frames)}" for value, frames in values.items())
 
 
-def _named(frames: Sequence[StatedFrame]) -> str:
+def _name_frames(frames: Sequence[StatedFrame]) -> str:
     names = [frame.file.name for frame in frames]
     listed = ", ".join(names[:2]) + (f" .. {names[-1]}" if len(names) > 2 else "")
     return f"{len(names)} frame{'s' if len(names) > 1 else ''} ({listed})"
 
 
-def _unstated(own: Sequence[StatedFrame], where: str) -> Iterator[str]:
+def _unstated(frames_of_side: Sequence[StatedFrame], where: str) -> Iterator[str]:
     """Yield a line for settings that some of the frames that are fitted together state and others don't."""
     missing: dict[tuple[str, ...], list[str]] = {}
     for setting in SETTINGS:
-        for group in _groups(setting, own):
+        for group in _groups(setting, frames_of_side):
             bound = [frame for frame in group if _is_bound(setting, frame)]
             for keyword in setting.keywords:
                 without = tuple(frame.file.name for frame in bound if keyword not in frame.settings)
@@ -257,7 +275,16 @@ ALL_FRAMES = HeaderChoice()
 
 
 def parse_choice(only: str, ignored: str) -> HeaderChoice:
-    """Return `--only KEY=VALUE,...` and `--ignore KEY,...` as a choice. Raises InputError, naming the option."""
+    """Return which frames to import by their headers, and which keywords to ignore.
+
+    only : `KEY=VALUE,...` of `--only`
+    ignored : `KEY,...` of `--ignore`
+
+    Raises InputError, which names the option.
+
+    >>> parse_choice("GAIN=100", "OFFSET").only
+    (('GAIN', '100'),)
+    """
     pairs = []
     for part in filter(None, (text.strip() for text in only.split(","))):
         keyword, equals, value = (text.strip() for text in part.partition("="))
@@ -281,7 +308,11 @@ def is_chosen(choice: HeaderChoice, kind: str, settings: Mapping[str, Value]) ->
 
 
 def states(settings: Mapping[str, Value], keyword: str, wanted: str) -> bool:
-    """Return whether settings hold a value that is written as `wanted`."""
+    """Return whether settings hold a value that is written as `wanted`.
+
+    >>> states({"GAIN": 100.0}, "GAIN", "100")
+    True
+    """
     try:
         value: Value = float(wanted)
     except ValueError:

@@ -32,7 +32,7 @@ from sim.spectrum import Spectrum
 
 
 def read_image(file: Path, page: int | None = None) -> Frame:
-    """Grey values of an image file as uint16 (rows, cols), as stored; `page`: of a TIFF with several, or the
+    """Return the grey values of an image file as uint16 (rows, cols), as stored; `page`: of a TIFF with several, or the
     plane of a FITS cube. InputError without the path."""
     suffix = file.suffix.lower()
     if suffix == ".npy" or suffix in RAWS:
@@ -50,19 +50,35 @@ def is_frame(file: Path) -> bool:
 
 
 def frame_name(path: str) -> str:
-    """Return the name of a frame's file without its ending, `.fits.gz` and `.fits.fz` included."""
+    """Return the name of a frame's file without its ending, `.fits.gz` and `.fits.fz` included.
+
+    >>> frame_name("frames/flat-1.fits.gz")
+    'flat-1'
+    """
     return Path(unpacked_name(path.rpartition("/")[2])).stem
 
 
 def has_alpha(image: NDArray[Any]) -> bool:
-    """Return whether an image (rows, cols[, channels]) has a channel of transparency beside its grey values or
-    colours."""
+    """Return whether an image has a channel of transparency beside its grey values or colours.
+
+    image : (rows, cols[, channels])
+
+    >>> has_alpha(np.zeros((4, 4, 4), np.uint8)), has_alpha(np.zeros((4, 4, 3), np.uint8))
+    (True, False)
+    """
     return image.shape[2:] in ((2,), (4,))
 
 
 def grey(image: NDArray[Any]) -> Frame:
-    """Return the grey values (rows, cols) of a decoded image; a channel of transparency is dropped. InputError for
-    colours, and for numbers that aren't codes of 0 to 65535."""
+    """Return the grey values (rows, cols), uint16, of a decoded image; a channel of transparency is dropped.
+
+    image : (rows, cols[, channels])
+
+    Raises InputError for colours, and for numbers that aren't codes of 0 to 65535.
+
+    >>> grey(np.full((2, 2, 3), 7, np.uint8)).tolist()
+    [[7, 7], [7, 7]]
+    """
     if image.ndim == 3:
         colours = image[..., :3]
         if image.shape[2] >= 3 and not np.array_equal(colours.min(axis=2), colours.max(axis=2)):
@@ -72,7 +88,11 @@ def grey(image: NDArray[Any]) -> Frame:
 
 
 def codes_of(image: NDArray[Any]) -> Frame:
-    """Return numbers as codes, uint16. InputError for fractions and for numbers beyond 0 to 65535."""
+    """Return numbers as codes, uint16, DN. Raises InputError for fractions and for numbers beyond 0 to 65535.
+
+    >>> codes_of(np.array([[64.0, 4095.0]])).tolist()
+    [[64, 4095]]
+    """
     if image.dtype not in (np.uint8, np.uint16):
         if image.dtype.kind not in "iuf" or not np.array_equal(image, np.rint(image)):
             raise InputError(f"its values are {image.dtype} with fractions; save raw DN as integers of 8 or 16 bit")
@@ -113,7 +133,7 @@ class ImageFiles(FolderFiles):
         return str(self.images[path]) if path in self.images else super().where(path)
 
 
-def described_sides(file: Path) -> dict[Side, dict[str, Any]]:
+def read_sides(file: Path) -> dict[Side, dict[str, Any]]:
     """Return what `camera.toml` says of each side: its keys at the top are of a single (left) camera, or of every side
     where it has the tables `[left]` and `[right]`. A missing file says nothing of the left one."""
     written: dict[str, Any] = {}
@@ -137,7 +157,7 @@ def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> 
     """Return the cameras that `camera.toml` describes, by the keys of a recording set's camera. Keys that it leaves out
     come from that side's `defaults`; a missing file is an empty one."""
     cameras = {}
-    for side, keys in described_sides(file).items():
+    for side, keys in read_sides(file).items():
         known = {key: value for key, value in keys.items() if key != "taps"}  # of the readout, not of the data sheet
         try:
             cameras[side] = DataSheet.model_validate({**defaults.get(side, {}), **known})
@@ -199,7 +219,7 @@ class Readout:
         """Rows and columns of the frames that come out."""
         return len(self.rows), len(self.cols)
 
-    def applied(self, frame: Frame) -> Frame:
+    def apply(self, frame: Frame) -> Frame:
         """Return a frame as it is stored, cropped, joined, and with its taps at one black level; codes don't fall
         below 0."""
         made = np.zeros(frame.shape, np.int64)
@@ -225,11 +245,11 @@ class TapFiles(ImageFiles):
 
     def frame(self, path: str, camera: DataSheet) -> Frame:
         frame = super().frame(path, camera)
-        return self.readouts[path].applied(frame) if path in self.readouts else frame
+        return self.readouts[path].apply(frame) if path in self.readouts else frame
 
 
 def parse_taps(listed: Any, where: str) -> tuple[Tap, ...]:
-    """`[[taps]]` of a camera file."""
+    """Return the taps that `[[taps]]` of a camera file lists, checked."""
     try:
         taps = tuple(Tap.model_validate(item) for item in listed)
     except (ValidationError, TypeError) as error:
@@ -247,7 +267,7 @@ def readout(taps: Sequence[Tap], files: Sequence[Path], shape: tuple[int, int], 
     the frame, the regions don't tile a rectangle, or a black level isn't known."""
     for tap in taps:
         _check_inside(tap, shape, where)
-    kept_rows, kept_cols, cut = _tiled(taps, shape, where)
+    kept_rows, kept_cols, cut = _tile_regions(taps, shape, where)
     unknown = [tap.name for tap in taps if tap.overscan is None and tap.black_level_dn is None]
     if unknown:
         raise InputError(
@@ -297,7 +317,7 @@ def _check_inside(tap: Tap, shape: tuple[int, int], where: str) -> None:
             )
 
 
-def _tiled(
+def _tile_regions(
     taps: Sequence[Tap], shape: tuple[int, int], where: str
 ) -> tuple[tuple[int, ...], tuple[int, ...], list[str]]:
     """Return the rows and the columns that the regions tile, and the runs between them that are cut out, in words."""

@@ -100,8 +100,8 @@ def _tiff_facts(file: Path) -> SensorFacts:
     except (OSError, ValueError, IndexError, tifffile.TiffFileError):
         return SensorFacts()
     try:
-        own = TiffDescription.model_validate_json(description)
-        return SensorFacts(own.cfa, own.bit_depth, (own.black_level_dn,), own.white_level_dn)
+        parsed = TiffDescription.model_validate_json(description)
+        return SensorFacts(parsed.cfa, parsed.bit_depth, (parsed.black_level_dn,), parsed.white_level_dn)
     except ValidationError:
         pass
     if period is None or not isinstance(pattern, bytes) or len(period) != 2 or max(pattern) >= len(CFA_COLOURS):
@@ -115,7 +115,7 @@ def _fits_facts(file: Path, ignored: Collection[str]) -> SensorFacts:
     return SensorFacts(header.cfa, mosaic_source=header.mosaic_source)
 
 
-def known_from_file(file: Path, shape: tuple[int, int], ignored: Collection[str] = ()) -> dict[str, Any]:
+def read_known_keys(file: Path, shape: tuple[int, int], ignored: Collection[str] = ()) -> dict[str, Any]:
     """Return the keys of a camera that a frame's file states, for a camera file that leaves them out."""
     facts = sensor_facts(file, shape, ignored)
     bits = picture_facts(file).bits if file.suffix.lower() in TIFFS else None
@@ -123,7 +123,7 @@ def known_from_file(file: Path, shape: tuple[int, int], ignored: Collection[str]
     return {key: value for key, value in known.items() if value is not None}
 
 
-def taken_from_file(stated: Collection[str], known: Mapping[str, Any], file: Path) -> list[str]:
+def list_keys_taken(stated: Collection[str], known: Mapping[str, Any], file: Path) -> list[str]:
     """Return the line for keys of a camera that aren't `stated` and that its first frame's file has (`known`)."""
     taken = [f"{key} = {_text(value)}" for key, value in known.items() if key not in stated]
     return [f"{file}: {', '.join(taken)}: not stated, and taken from this file"] if taken else []
@@ -144,7 +144,7 @@ def compare_with_files(
     `stated`: keys of the camera that somebody states. `boards`: files of boards, whose corners JPEG hardly moves.
     `is_whole`: the camera's frames are the files', not joined of the parts that taps read. `ignored`: keywords of
     headers that aren't used."""
-    found: dict[str, list[Path]] = {}
+    files_of_line: dict[str, list[Path]] = {}
     for file in dict.fromkeys(files):
         try:
             facts = sensor_facts(file, (camera.rows, camera.cols), ignored) if is_whole else SensorFacts()
@@ -158,14 +158,14 @@ def compare_with_files(
             )
         lines = (*_sensor_lines(camera, stated, facts), *_picture_lines(camera, picture, is_board=file in boards))
         for line in lines:
-            found.setdefault(line, []).append(file)
+            files_of_line.setdefault(line, []).append(file)
         if turned := {facts.orientation, picture.orientation} - {1}:
-            found.setdefault(
+            files_of_line.setdefault(
                 f"its Orientation is {turned.pop()}, which turns it for a viewer: the frame is taken as stored, and "
                 "cfa, regions and corners count from its first stored pixel",
                 [],
             ).append(file)
-    return [f"{own[0]}{_more(own)}: {line}" for line, own in found.items()]
+    return [f"{concerned[0]}{_more(concerned)}: {line}" for line, concerned in files_of_line.items()]
 
 
 def _sensor_lines(camera: DataSheet, stated: Collection[str], facts: SensorFacts) -> Iterable[str]:
@@ -174,18 +174,18 @@ def _sensor_lines(camera: DataSheet, stated: Collection[str], facts: SensorFacts
     if len({round(level, 3) for level in facts.black_dn}) > 1:
         levels = ", ".join(f"{level:g}" for level in facts.black_dn)
         yield f"its file states one black level a colour ({levels} DN): black_level_dn is one for all"
-    for key, own in (
+    for key, of_file in (
         ("bit_depth", facts.bit_depth),
         ("black_level_dn", facts.black_level_dn),
         ("white_level_dn", facts.white_dn),
     ):
         value = camera.saturation_dn if key == "white_level_dn" else getattr(camera, key)
-        if own is None or value is None or abs(value - own) <= (SAME_DN if key.endswith("_dn") else 0):
+        if of_file is None or value is None or abs(value - of_file) <= (SAME_DN if key.endswith("_dn") else 0):
             continue
         if key in stated:
-            yield f"{key} = {value:g}, its file states {own:g}; the former is used: correct what is wrong"
+            yield f"{key} = {value:g}, its file states {of_file:g}; the former is used: correct what is wrong"
         elif key == "white_level_dn":
-            yield f"the highest code is taken as {value:g} DN (bit_depth), its file states {own:g}: state {key}"
+            yield f"the highest code is taken as {value:g} DN (bit_depth), its file states {of_file:g}: state {key}"
 
 
 def _picture_lines(camera: DataSheet, picture: PictureFacts, *, is_board: bool) -> Iterable[str]:

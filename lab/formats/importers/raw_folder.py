@@ -35,7 +35,6 @@ from lab.formats.importers.images import (
     Readout,
     Tap,
     TapFiles,
-    described_sides,
     frame_name,
     grey,
     has_alpha,
@@ -43,10 +42,11 @@ from lab.formats.importers.images import (
     parse_taps,
     read_camera_file,
     read_image,
+    read_sides,
     readout,
 )
-from lab.formats.importers.own_statements import compare_with_files, known_from_file, taken_from_file
-from lab.formats.importers.stated_settings import frame_header, held_against_frames
+from lab.formats.importers.own_statements import compare_with_files, list_keys_taken, read_known_keys
+from lab.formats.importers.stated_settings import check_against_frames, frame_header
 from lab.formats.pictures import IMAGES, TIFFS, picture_facts, read_picture
 from lab.formats.recording_set import DataSheet, Manifest, RecordingError, RecordingSet, parse_manifest
 from lab.formats.recording_set.files import locate_as_written
@@ -80,8 +80,8 @@ def read_index(file: Path, needed: tuple[str, ...] = ("frame", "kind")) -> Index
     if not file.is_file():
         raise InputError(f"{file}: missing; write one row a capture: {wanted},...")
     try:
-        found = read_foreign_csv(file)
-        reader = csv.reader(found.text.splitlines())
+        text = read_foreign_csv(file)
+        reader = csv.reader(text.text.splitlines())
         header = [cell.strip() for cell in next(reader, [])]
         listed = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except csv.Error as error:
@@ -99,7 +99,7 @@ def read_index(file: Path, needed: tuple[str, ...] = ("frame", "kind")) -> Index
         rows.append((number, cells))
     if not rows:
         raise InputError(f"{file}: lists no captures; write one row a capture")
-    remarks = [f"{file}: {remark}" for remark in found.remarks]
+    remarks = [f"{file}: {remark}" for remark in text.remarks]
     if unused:
         remarks.append(f"{file}: columns that no capture has are left out: {', '.join(unused)}")
     return Index(rows, tuple(remarks))
@@ -112,8 +112,8 @@ def _check_header(file: Path, header: list[str], needed: tuple[str, ...]) -> lis
     unknown = [name for name in header if name and name not in known]
     meant = [(name, near) for name in unknown if (near := nearest_name(name, known)) is not None and near not in header]
     if meant:
-        told = "; ".join(f"'{name}': write {in_its_unit(near)}" for name, near in meant)
-        raise InputError(f"{file}: unknown column {told}")
+        corrections = "; ".join(f"'{name}': write {in_its_unit(near)}" for name, near in meant)
+        raise InputError(f"{file}: unknown column {corrections}")
     missing = [f"'{name}'" for name in needed if name not in header]
     if missing:
         raise InputError(
@@ -138,8 +138,15 @@ def _columns() -> list[str]:
 
 
 def capture_of_row(row: dict[str, str]) -> dict[str, Any]:
-    """Return a row as a capture's keys: lists and numbers out of their cells, `screen.x` into `screen`. Raises
-    InputError without the row."""
+    """Return a row of an index as a capture's keys: lists and numbers out of their cells, `screen.x` into `screen`.
+
+    row : cells by column
+
+    Raises InputError without the row.
+
+    >>> capture_of_row({"frame": "edge.tif", "kind": "slanted_edge", "region": "0 0 64 64"})["region"]
+    [0, 0, 64, 64]
+    """
     if "frame" not in row or "kind" not in row:
         raise InputError("the frame or its kind is missing; write both")
     if row["kind"] == "checkerboard" and "squares" in row and "square_mm" in row:
@@ -198,11 +205,11 @@ def recordings_of_index(
     if not cameras.is_file():
         raise InputError(f"{cameras}: missing; write the camera's keys, `cfa` at least")
     taps: dict[Side, tuple[Tap, ...]] = {}
-    for side, keys in described_sides(cameras).items():
+    for side, keys in read_sides(cameras).items():
         listed = parse_taps(keys.get("taps", ()), str(cameras))
-        taps[side] = tuple(one for one in listed if one.name == tap) if tap else listed
+        taps[side] = tuple(tap_of_side for tap_of_side in listed if tap_of_side.name == tap) if tap else listed
         if tap and not taps[side]:
-            names = ", ".join(one.name for one in listed) or "none"
+            names = ", ".join(tap_of_side.name for tap_of_side in listed) or "none"
             raise InputError(f"--tap {tap}: {cameras} describes no such tap of the {side} camera; it has {names}")
     remarks = tuple(f"{cameras}: {remark}" for remark in read_foreign_text(cameras).remarks)
     index = _of_choice(path, replace(index, remarks=index.remarks + remarks), where, choice)
@@ -227,10 +234,10 @@ def _of_choice(path: Path, index: Index, where: str, choice: HeaderChoice) -> In
         if file not in stated or is_chosen(choice, row.get("kind", ""), settings.get(file, {}))
     ]
     for keyword, wanted in choice.only:
-        there = {text_of(own[keyword]) for own in settings.values() if keyword in own}
-        if not any(states(own, keyword, wanted) for own in settings.values()):
-            found = f"they state {', '.join(sorted(there))}" if there else "none states it"
-            raise InputError(f"--only {keyword}={wanted}: no frame's header states that, {found}; correct it")
+        there = {text_of(header[keyword]) for header in settings.values() if keyword in header}
+        if not any(states(header, keyword, wanted) for header in settings.values()):
+            offered = f"they state {', '.join(sorted(there))}" if there else "none states it"
+            raise InputError(f"--only {keyword}={wanted}: no frame's header states that, {offered}; correct it")
     option = ",".join("=".join(pair) for pair in choice.only)
     if not kept:
         raise InputError(f"{where}: no frame's header states all of {option} (--only); give one of them")
@@ -247,7 +254,7 @@ def _has(file: Path, keyword: str, settings: Mapping[Path, Mapping[str, object]]
 
 
 def read_checkerboard_pairs(path: Path, corners: tuple[int, int], square_mm: float) -> RecordingSet:
-    """Pairs of images `leftNN` and `rightNN` of a plain checkerboard as a recording set of two grey cameras.
+    """Read pairs of images `leftNN` and `rightNN` of a plain checkerboard as a recording set of two grey cameras.
 
     `corners`: inner corners of the board, (rows, cols), one less than its squares. Only whole pairs are taken; the
     warnings say which images were left out.
@@ -283,7 +290,7 @@ def read_checkerboard_pairs(path: Path, corners: tuple[int, int], square_mm: flo
 def read_boards(
     path: Path, dictionary: Literal["none", "dots"], points: tuple[int, int], spacing_mm: float
 ) -> RecordingSet:
-    """Pictures of a plane board, each in another pose, as a recording set of one camera.
+    """Read pictures of a plane board, each in another pose, as a recording set of one camera.
 
     `points`: inner corners of a plain checkerboard (`dictionary` none) or dots, (rows, cols). `path`: a folder of
     images in the order of their names, or one image; `camera.toml` beside them has the camera's keys, `cfa` at least.
@@ -311,7 +318,7 @@ def read_boards(
 
 
 def read_dot_grids(path: Path, dots: tuple[int, int], spacing_mm: float) -> RecordingSet:
-    """Pictures of a plane grid of `dots` (rows, cols): see `read_boards`."""
+    """Read pictures of a plane grid of `dots` (rows, cols): see `read_boards`."""
     return read_boards(path, "dots", dots, spacing_mm)
 
 
@@ -323,9 +330,9 @@ def _recording_set(
     taps: Mapping[Side, tuple[Tap, ...]] = {},
     choice: HeaderChoice = ALL_FRAMES,
 ) -> RecordingSet:
-    listed = _listed_frames(path, index, where)
+    listed = _list_frames(path, index, where)
     captures, images, numbers = listed.captures, listed.images, listed.numbers
-    measured, known, remarks = _measured(listed, choice.ignored)
+    measured, known, remarks = _measure_frames(listed, choice.ignored)
     if listed.stacks:
         more = f" and {len(listed.stacks) - 3} more" if len(listed.stacks) > 3 else ""
         remarks.append(
@@ -335,8 +342,8 @@ def _recording_set(
     readouts: dict[Side, Readout] = {}
     for side, own_taps in taps.items():
         if own_taps and side in measured:
-            own = [images[capture["frame"]] for capture in captures if capture["side"] == side]
-            cut = readout(own_taps, own, (measured[side]["rows"], measured[side]["cols"]), str(path / CAMERA))
+            files_of_side = [images[capture["frame"]] for capture in captures if capture["side"] == side]
+            cut = readout(own_taps, files_of_side, (measured[side]["rows"], measured[side]["cols"]), str(path / CAMERA))
             measured[side] |= {"rows": cut.shape[0], "cols": cut.shape[1], "black_level_dn": cut.black_level_dn}
             for key in ("cfa", "black_level_dn"):  # of the whole sensor
                 if known[side].pop(key, None) is not None and key == "cfa":
@@ -361,17 +368,17 @@ def _recording_set(
     except RecordingError as error:
         raise RecordingError(_by_row(error.problems, numbers)) from error
     warnings = _by_row(warnings, numbers)
-    remarks += [remark for one in readouts.values() for remark in one.remarks]
+    remarks += [remark for side_readout in readouts.values() for remark in side_readout.remarks]
     remarks += remarks_on(path, _spectra(manifest))
-    manifest, said = held_against_frames(manifest, images, where, choice)
+    manifest, said = check_against_frames(manifest, images, where, choice)
     remarks += said
-    statements = described_sides(path / CAMERA)
+    statements = read_sides(path / CAMERA)
     for side, camera in described.items():
         files = {images[capture["frame"]]: capture["kind"] for capture in captures if capture["side"] == side}
         stated = statements.get(side, {})
         if files:
             boards = [file for file, kind in files.items() if kind == "charuco"]
-            remarks += taken_from_file(stated, known[side], next(iter(files)))
+            remarks += list_keys_taken(stated, known[side], next(iter(files)))
             remarks += compare_with_files(camera, stated, files, boards, choice.ignored, is_whole=side not in readouts)
     by_frame = {capture["frame"]: readouts[capture["side"]] for capture in captures if capture["side"] in readouts}
     return RecordingSet(
@@ -396,7 +403,7 @@ class _ListedFrames:
     renamed: list[str] = field(default_factory=list)
 
 
-def _listed_frames(path: Path, index: Index, where: str) -> _ListedFrames:
+def _list_frames(path: Path, index: Index, where: str) -> _ListedFrames:
     """Return the captures of an index with ids that are unique where the rows state none. Raises RecordingError with
     one line for each row whose frame can't be used."""
     listed = _ListedFrames()
@@ -418,14 +425,14 @@ def _listed_frames(path: Path, index: Index, where: str) -> _ListedFrames:
         if many > 1:
             listed.stacks.append(f"{capture['frame']} ({many})")
         for page in range(many):
-            name = _unused(stem if many == 1 else f"{stem}-p{page + 1}", used)
+            name = _make_unique(stem if many == 1 else f"{stem}-p{page + 1}", used)
             frame = f"frames/{name}.npy"
-            own = {"id": name, "side": "left", "exposure_s": None} | capture | {"frame": frame}
+            keys = {"id": name, "side": "left", "exposure_s": None} | capture | {"frame": frame}
             if many > 1:
                 listed.pages[frame] = page
-                own |= {"id": name} | ({"pose": f"{capture['pose']}-p{page + 1}"} if "pose" in capture else {})
-                own.pop("time", None)  # of one page, and which isn't known
-            listed.captures.append(own)
+                keys |= {"id": name} | ({"pose": f"{capture['pose']}-p{page + 1}"} if "pose" in capture else {})
+                keys.pop("time", None)  # of one page, and which isn't known
+            listed.captures.append(keys)
             listed.images[frame] = file
             listed.numbers.append(number)
     if problems:
@@ -438,11 +445,11 @@ def _stem(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name)
 
 
-def _unused(name: str, used: set[str]) -> str:
+def _make_unique(name: str, used: set[str]) -> str:
     """Return the name, with the first number behind it that makes it a new one where it is used; it is used from now
     on."""
     numbered = (name if number == 1 else f"{name}-{number}" for number in count(1))
-    free = next(one for one in numbered if one not in used)
+    free = next(candidate for candidate in numbered if candidate not in used)
     used.add(free)
     return free
 
@@ -456,16 +463,16 @@ def _pages(file: Path) -> int:
 
 def _by_row(lines: Sequence[str], numbers: Sequence[int]) -> list[str]:
     """Lines on captures as lines on their rows, one for all rows of which the same is said."""
-    found: dict[tuple[str, str], list[str]] = {}
+    rows_of_line: dict[tuple[str, str], list[str]] = {}
     for line in lines:
         parts = re.fullmatch(r"(.*: )captures\[(\d+)\]( \(.*?\))?(: .*)", line, re.S)
         key, row = (
             ((parts[1], parts[4]), f"row {numbers[int(parts[2])]}{parts[3] or ''}") if parts else ((line, ""), "")
         )
-        found.setdefault(key, []).append(row)
+        rows_of_line.setdefault(key, []).append(row)
     return [
         f"{before}{of[0]}{f' and {len(of) - 1} more' if len(of) > 1 else ''}{after}"
-        for (before, after), of in found.items()
+        for (before, after), of in rows_of_line.items()
     ]
 
 
@@ -476,7 +483,7 @@ def _spectra(manifest: Manifest) -> list[str]:
     return list(dict.fromkeys(named))
 
 
-def _measured(
+def _measure_frames(
     listed: _ListedFrames, ignored: Collection[str]
 ) -> tuple[dict[Side, dict[str, Any]], dict[Side, dict[str, Any]], list[str]]:
     """What each side's first image tells and `camera.toml` may leave out: rows and columns, and the bit depth of files
@@ -493,7 +500,7 @@ def _measured(
         try:
             image = read_picture(first, listed.pages.get(name)) if first.suffix.lower() in IMAGES else None
             frame = read_image(first, listed.pages.get(name)) if image is None else grey(image)
-            known[side] = known_from_file(first, (frame.shape[0], frame.shape[1]), ignored)
+            known[side] = read_known_keys(first, (frame.shape[0], frame.shape[1]), ignored)
         except InputError as error:
             raise InputError(f"{first}: {error}") from error
         measured[side] = {"rows": frame.shape[0], "cols": frame.shape[1]}

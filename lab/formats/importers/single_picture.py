@@ -21,14 +21,14 @@ from pydantic import ValidationError
 
 from lab.errors import InputError
 from lab.formats.cgats import read_foreign_csv
-from lab.formats.importers.images import codes_of, described_sides, has_alpha, read_image
+from lab.formats.importers.images import codes_of, has_alpha, read_image, read_sides
 from lab.formats.importers.own_statements import (
     compare_with_files,
-    known_from_file,
+    list_keys_taken,
+    read_known_keys,
     subsampling_remark,
-    taken_from_file,
 )
-from lab.formats.importers.stated_settings import held_against_frames
+from lab.formats.importers.stated_settings import check_against_frames
 from lab.formats.pictures import IMAGES, picture_facts, read_picture
 from lab.formats.recording_set import DataSheet, Frame, Manifest, RecordingSet, frame_problem
 from lab.formats.spectrum_csv import parse_spectrum
@@ -63,24 +63,35 @@ class ImportOptions:
     ignore: str | None = None
 
     def stated(self) -> tuple[str, ...]:
-        """Names of the options that are stated, as on the command line."""
+        """Return the names of the options that are stated, as on the command line."""
         names = (field.name for field in fields(self))
         return tuple(f"--{name.replace('_', '-')}" for name in names if getattr(self, name) is not None)
 
 
 def grid(option: str, text: str) -> tuple[int, int] | None:
-    """ROWSxCOLS as two numbers; None where `text` is empty. Raises InputError, with the option's name."""
+    """Return ROWSxCOLS as two numbers; None where `text` is empty.
+
+    option : its name, with which an InputError begins
+
+    >>> grid("--squares", "6x9")
+    (6, 9)
+    """
     if not text:
         return None
-    found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
-    if found is None:
+    match = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+    if match is None:
         raise InputError(f"{option} {text}: give ROWSxCOLS, as in 6x9")
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])
 
 
 def chart_corners(option: str, text: str) -> tuple[tuple[float, float], ...] | None:
-    """Eight numbers with commas as four corners (row, col); None where `text` is empty. Raises InputError, with the
-    option's name."""
+    """Return eight numbers with commas as four corners (row, col), px; None where `text` is empty.
+
+    option : its name, with which an InputError begins
+
+    >>> chart_corners("--corners", "10,20,10,620,470,620,470,20")[1]
+    (10.0, 620.0)
+    """
     if not text:
         return None
     try:
@@ -118,10 +129,10 @@ def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
     """
     lit = options.light is None and options.white_patch is None
     missing = ("--light or --white-patch (CSV of the light's radiance)",) if lit else ()
-    frame, camera, notes = read_picture_and_camera(path, options, _remosaiced, missing)
+    frame, camera, notes = read_picture_and_camera(path, options, _remosaic, missing)
     corners = options.corners
     if corners is None:
-        corners = located_chart(frame, camera)
+        corners = locate_chart(frame, camera)
         if corners is None:
             raise InputError(f"{path}: no ColorChecker of 24 patches found; give its --corners")
         said = " ".join(f"{value:.0f}" for corner in corners for value in corner)
@@ -132,9 +143,9 @@ def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
     return build_recording_set(path, frame, camera, options, capture, (*notes, *remarks), {"spectra/light.csv": light})
 
 
-def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
-    """Corners of the grid of patches, [row, col] of dark skin, bluish green, black, white; None where no chart is
-    found.
+def locate_chart(frame: Frame, camera: DataSheet) -> Corners | None:
+    """Find the corners of the grid of patches, [row, col] of dark skin, bluish green, black, white; None where no chart
+    is found.
 
     Patches are found by OpenCV's MCC detector in the mosaic binned to its period; a homography through the 24 centres
     gives the corners."""
@@ -156,8 +167,8 @@ def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
     grid = np.column_stack([(col + 0.5) / PATCH_COLS, (row + 0.5) / PATCH_ROWS])
     homography, _ = cv2.findHomography(grid, centres)
     square = np.array([[[0.0, 0.0]], [[1.0, 0.0]], [[1.0, 1.0]], [[0.0, 1.0]]])
-    found = cv2.perspectiveTransform(square, homography)[:, 0] * step + 0.5 * (step - 1)
-    corners = tuple((float(y), float(x)) for x, y in found)
+    corners_px = cv2.perspectiveTransform(square, homography)[:, 0] * step + 0.5 * (step - 1)
+    corners = tuple((float(y), float(x)) for x, y in corners_px)
     return _upright(frame, camera, corners)
 
 
@@ -177,13 +188,13 @@ def _upright(frame: Frame, camera: DataSheet, corners: Corners) -> Corners:
     """Return the corners in the order of a chart that isn't mirrored, of whose two the grey row falls: the detector may
     take it turned or mirrored where light has one colour."""
     orders = ((0, 1, 2, 3), (2, 3, 0, 1), (1, 0, 3, 2), (3, 2, 1, 0))
-    found = [tuple(corners[k] for k in order) for order in orders]
+    candidates = [tuple(corners[k] for k in order) for order in orders]
 
     def is_front(c: Corners) -> bool:
         (y0, x0), (y1, x1), _, (y3, x3) = c
         return (x1 - x0) * (y3 - y0) - (y1 - y0) * (x3 - x0) > 0
 
-    front = [c for c in found if is_front(c)]
+    front = [c for c in candidates if is_front(c)]
     return max(front, key=lambda c: -float(np.polyfit(np.arange(PATCH_COLS), grey_levels(frame, c), 1)[0]))
 
 
@@ -197,11 +208,11 @@ def read_picture_and_camera(
     `plane_of`: frame and mosaic of a colour picture (rows, cols, 3) in R, G, B."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; give one picture")
-    file, keys = _stated_camera(path, options)
+    file, keys = _read_stated_camera(path, options)
     is_image = path.suffix.lower() in IMAGES
     with _about(path):
         image = read_picture(path) if is_image else read_image(path)
-        known = known_from_file(path, (image.shape[0], image.shape[1]))
+        known = read_known_keys(path, (image.shape[0], image.shape[1]))
         colours = image.ndim == 3 and image.shape[2] >= 3 and bool(np.ptp(image[..., :3], axis=2).any())
         notes = _refuse_mixed_channels(path, options) if is_image and colours else ()
     stated = frozenset(keys)
@@ -215,7 +226,7 @@ def read_picture_and_camera(
         image, keys["cfa"] = plane_of(image[..., :3])
         notes += (f"{path}: a colour picture: its pixels are no mosaic's, and neighbours share their noise",)
     else:
-        notes += tuple(taken_from_file(stated, known, path))
+        notes += tuple(list_keys_taken(stated, known, path))
     with _about(path):
         frame = codes_of(image[..., 0] if image.ndim == 3 else image)
     camera = _camera_of(file, keys, frame)
@@ -252,13 +263,13 @@ def _refuse_unstated(
     """Raise InputError that names everything that isn't stated."""
     needed = (*(("cfa",) if needs_cfa else ()), "bit_depth", "black_level_dn")
     lacking = [key for key in needed if key not in keys]
-    told = ([f"{', '.join(lacking)} ({file})"] if lacking else []) + list(missing)
+    lacking_options = ([f"{', '.join(lacking)} ({file})"] if lacking else []) + list(missing)
     if options.exposure_s is None:
-        told.append("--exposure-s")
+        lacking_options.append("--exposure-s")
     if path.suffix.lower() in IMAGES and options.transfer is None:
-        told.append("--transfer linear, or srgb where the picture is made for a screen")
-    if told:
-        raise InputError(f"{path}: isn't stated: {'; '.join(told)}; state them")
+        lacking_options.append("--transfer linear, or srgb where the picture is made for a screen")
+    if lacking_options:
+        raise InputError(f"{path}: isn't stated: {'; '.join(lacking_options)}; state them")
 
 
 def _refuse_mixed_channels(path: Path, options: ImportOptions) -> tuple[str, ...]:
@@ -281,12 +292,12 @@ def _camera_of(file: Path, keys: Mapping[str, Any], frame: Frame) -> DataSheet:
         raise InputError(f"{file}: {'.'.join(map(str, first['loc']))}: {first['msg']}; correct it") from error
 
 
-def _stated_camera(path: Path, options: ImportOptions) -> tuple[Path, dict[str, Any]]:
+def _read_stated_camera(path: Path, options: ImportOptions) -> tuple[Path, dict[str, Any]]:
     """Return the camera file of a picture, and its keys."""
     file = options.camera if options.camera is not None else path.parent / CAMERA
     if options.camera is not None and not file.is_file():
         raise InputError(f"{file}: no such file; give the camera file of --camera")
-    sides = described_sides(file)
+    sides = read_sides(file)
     if "left" not in sides:
         raise InputError(f"{file}: describes no left camera; write the keys without a table")
     return file, dict(sides["left"])
@@ -315,7 +326,7 @@ def take_channel(image: NDArray[Any], options: ImportOptions) -> tuple[Frame, st
     return image[..., "RGB".index(options.channel)], "MONO"
 
 
-def _remosaiced(image: NDArray[Any]) -> tuple[Frame, str]:
+def _remosaic(image: NDArray[Any]) -> tuple[Frame, str]:
     """Return a colour picture (rows, cols, 3) sampled like a mosaic."""
     rows, cols = (n // 2 * 2 for n in image.shape[:2])
     made = np.empty((rows, cols), image.dtype)
@@ -358,7 +369,7 @@ def _check_grey_row(path: Path, frame: Frame, camera: DataSheet, corners: Corner
 
 
 def grey_levels(frame: Frame, corners: Corners) -> NDArray[np.floating[Any]]:
-    """Mean DN of the inner parts of the patches of the grey row, white first."""
+    """Return the mean DN of the inner parts of the patches of the grey row, white first."""
     corner, v = np.array(corners, float), (PATCH_ROWS - 0.5) / PATCH_ROWS
     half = max(int(0.15 * np.linalg.norm(corner[1] - corner[0]) / PATCH_COLS), 1)
     levels = []
@@ -376,11 +387,11 @@ def _light(options: ImportOptions) -> tuple[Spectrum, tuple[str, ...]]:
     file = options.light if options.light is not None else options.white_patch
     assert file is not None
     try:
-        found = read_foreign_csv(file)
-        spectrum = parse_spectrum(found.text)
+        text = read_foreign_csv(file)
+        spectrum = parse_spectrum(text.text)
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
-    remarks = tuple(f"{file}: {remark}" for remark in found.remarks)
+    remarks = tuple(f"{file}: {remark}" for remark in text.remarks)
     if options.light is not None:
         return spectrum, remarks
     white = next(value for name, value in reflectances(CHART).items() if name.startswith("white"))
@@ -406,5 +417,5 @@ def build_recording_set(
             "captures": [capture | {"side": "left", "frame": stored, "exposure_s": options.exposure_s}],
         }
     )
-    manifest, said = held_against_frames(manifest, {stored: path}, str(path))
+    manifest, said = check_against_frames(manifest, {stored: path}, str(path))
     return RecordingSet(manifest, {stored: frame}, spectra, source=str(path), warnings=(*notes, *said))

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import log10
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -82,25 +83,25 @@ def frame_header(file: Path, ignored: Collection[str] = ()) -> FrameHeader | Non
     """Return the header of a frame's file without `ignored` keywords; None where it states nothing that is known
     here."""
     suffix = file.suffix.lower()
-    found: FrameHeader | None = None
+    header: FrameHeader | None = None
     try:
         if is_fits(file):
             return _of_fits(fits_header(file, with_image=False, ignored=ignored))
         if suffix in RAWS:
-            found = _of_raw(file)
+            header = _of_raw(file)
         elif suffix in (".tif", ".tiff"):
             with file.open("rb") as stream:
-                found = _of_tiff(stream)
+                header = _of_tiff(stream)
         elif suffix in (".jpg", ".jpeg", ".png"):
             with file.open("rb") as stream:
                 data = stream.read(HEAD_BYTES)
             block = _exif_of_png(data) if data.startswith(PNG) else _exif_of_jpeg(data)
-            found = _of_tiff(io.BytesIO(block)) if block is not None else None
+            header = _of_tiff(io.BytesIO(block)) if block is not None else None
     except (OSError, InputError, rawpy.LibRawError):
         return None
-    if found is None or not ignored:
-        return found
-    return replace(found, settings={key: value for key, value in found.settings.items() if key not in ignored})
+    if header is None or not ignored:
+        return header
+    return replace(header, settings={key: value for key, value in header.settings.items() if key not in ignored})
 
 
 def _of_fits(header: FitsHeader) -> FrameHeader:
@@ -122,20 +123,20 @@ def _of_fits(header: FitsHeader) -> FrameHeader:
 
 def _of_raw(file: Path) -> FrameHeader | None:
     with file.open("rb") as stream:  # most raws are TIFF
-        told = _of_tiff(stream)
+        tags = _of_tiff(stream)
     with rawpy.imread(str(file)) as raw:
         taken = getattr(raw, "other", None)  # older versions don't tell it
         if taken is None:
             return None
         f_number, iso = _above_zero(taken.aperture), _above_zero(taken.iso_speed)
-        settings = dict(told.settings) if told is not None else {}
+        settings = dict(tags.settings) if tags is not None else {}
         of_dials = {"FNumber": f_number, "ISO": iso, "FocalLength": _above_zero(taken.focal_length)}
         return FrameHeader(
             "metadata",
             exposure_s=_above_zero(taken.shutter_speed),
             f_number=f_number,
             iso=iso,
-            camera=told.camera if told is not None else None,
+            camera=tags.camera if tags is not None else None,
             settings=settings | {key: value for key, value in of_dials.items() if value is not None},
         )
 
@@ -151,8 +152,8 @@ def _of_tiff(stream: Any) -> FrameHeader | None:
     inner = tags.get("ExifTag")
     tags |= inner if isinstance(inner, dict) else {}
     try:
-        own = TiffDescription.model_validate_json(str(tags.get("ImageDescription", "")))
-        return FrameHeader("description", exposure_s=_above_zero(own.exposure_s), gain_db=own.gain_db)
+        description = TiffDescription.model_validate_json(str(tags.get("ImageDescription", "")))
+        return FrameHeader("description", exposure_s=_above_zero(description.exposure_s), gain_db=description.gain_db)
     except ValidationError:
         pass
     f_number = _above_zero(tags.get("FNumber"))
@@ -248,7 +249,7 @@ UNIT_FACTORS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 FEWEST_ROWS, FEWEST_OFF = 4, 2
 
 
-def held_against_frames(
+def check_against_frames(
     manifest: Manifest, images: Mapping[str, Path], where: str, choice: HeaderChoice = ALL_FRAMES
 ) -> tuple[Manifest, list[str]]:
     """Return the manifest with what the frames' own files add to it: cameras, temperatures and gains (dB) that it
@@ -264,39 +265,42 @@ def held_against_frames(
         for capture in manifest.captures
         if (header := by_file[images[capture.frame]]) is not None
     ]
-    whole, lines = _completed(manifest, seen)
+    whole, lines = _complete_from_headers(manifest, seen)
     places = {id(capture): place for place, capture in enumerate(manifest.captures)}
-    seen = [replace(one, capture=whole.captures[places[id(one.capture)]]) for one in seen]
+    seen = [replace(frame, capture=whole.captures[places[id(frame.capture)]]) for frame in seen]
     manifest = whole
     lines += _contradictions(manifest, seen, images, where)
     problems, uneven = compare_settings(
-        [StatedFrame(one.capture, one.file, one.header.settings) for one in seen], where
+        [StatedFrame(frame.capture, frame.file, frame.header.settings) for frame in seen], where
     )
     for side, camera in manifest.cameras.items():
-        own = [one for one in seen if one.capture.side == side]
-        problems += _stacked(own)
-        lines += _other_pitch(own, camera)
+        frames = [frame for frame in seen if frame.capture.side == side]
+        problems += _stacked_line(frames)
+        lines += _other_pitch(frames, camera)
     if problems:
         raise RecordingError(problems)
     cameras = {
-        f"camera {side}": _named_camera([one for one in seen if one.capture.side == side]) for side in manifest.cameras
+        f"camera {side}": _named_camera([frame for frame in seen if frame.capture.side == side])
+        for side in manifest.cameras
     }
     there = {name: camera for name, camera in cameras.items() if camera is not None}
     return manifest.model_copy(update={"instruments": there}) if there else manifest, lines + uneven + _remarks(seen)
 
 
-def _completed(manifest: Manifest, seen: Sequence[_HeaderSeen]) -> tuple[Manifest, list[str]]:
+def _complete_from_headers(manifest: Manifest, seen: Sequence[_HeaderSeen]) -> tuple[Manifest, list[str]]:
     """Return the manifest with temperatures and gains that it leaves open and the frames' own files state, and a line
     for each quantity."""
     captures = {id(capture): capture for capture in manifest.captures}
     lines = []
     for key, unit in (("temperature_c", "degree C"), ("gain_db", "dB")):
-        added = [one for one in seen if getattr(one.capture, key) is None and getattr(one.header, key) is not None]
-        for one in added:
-            known = {key: getattr(one.header, key)}
-            captures[id(one.capture)] = captures[id(one.capture)].model_copy(update=known)
+        added = [
+            frame for frame in seen if getattr(frame.capture, key) is None and getattr(frame.header, key) is not None
+        ]
+        for frame in added:
+            known = {key: getattr(frame.header, key)}
+            captures[id(frame.capture)] = captures[id(frame.capture)].model_copy(update=known)
         if added:
-            values = [getattr(one.header, key) for one in added]
+            values = [getattr(frame.header, key) for frame in added]
             span = f"{min(values):g}" + (f" .. {max(values):g}" if max(values) > min(values) else "")
             lines.append(f"{added[0].file}: {key} = {span} {unit} by its {added[0].header.source}{_and(added)}")
     if not lines:
@@ -304,9 +308,9 @@ def _completed(manifest: Manifest, seen: Sequence[_HeaderSeen]) -> tuple[Manifes
     return manifest.model_copy(update={"captures": tuple(captures.values())}), lines
 
 
-def _named_camera(own: Sequence[_HeaderSeen]) -> InstrumentSnapshot | None:
+def _named_camera(frames: Sequence[_HeaderSeen]) -> InstrumentSnapshot | None:
     """Return the camera that the frames of one side name, with the settings that all of them share."""
-    named = [one.header.camera for one in own if one.header.camera is not None]
+    named = [frame.header.camera for frame in frames if frame.header.camera is not None]
     if not named:
         return None
     shared = {
@@ -317,9 +321,9 @@ def _named_camera(own: Sequence[_HeaderSeen]) -> InstrumentSnapshot | None:
     return named[0].model_copy(update={"settings": shared})
 
 
-def _stacked(own: Sequence[_HeaderSeen]) -> list[str]:
+def _stacked_line(frames: Sequence[_HeaderSeen]) -> list[str]:
     """Return the line for frames that are means or sums of several."""
-    off = [one for one in own if one.header.stacked is not None and one.capture.codes_are_fitted]
+    off = [frame for frame in frames if frame.header.stacked is not None and frame.capture.codes_are_fitted]
     if not off:
         return []
     line = (
@@ -329,16 +333,16 @@ def _stacked(own: Sequence[_HeaderSeen]) -> list[str]:
     return [line]
 
 
-def _other_pitch(own: Sequence[_HeaderSeen], camera: DataSheet) -> list[str]:
+def _other_pitch(frames: Sequence[_HeaderSeen], camera: DataSheet) -> list[str]:
     """Return the line for frames whose headers state another pixel pitch than the camera's."""
     pitch_um = camera.pixel_pitch_um
-    line = _said(
+    line = _difference_line(
         "pixel_pitch_um",
         "um",
         [
-            (one, pitch_um, one.header.pixel_pitch_um)
-            for one in own
-            if _differ(pitch_um, one.header.pixel_pitch_um, PITCH_SHARE * (pitch_um or 0.0))
+            (frame, pitch_um, frame.header.pixel_pitch_um)
+            for frame in frames
+            if _differ(pitch_um, frame.header.pixel_pitch_um, PITCH_SHARE * (pitch_um or 0.0))
         ],
     )
     return [line] if line else []
@@ -348,42 +352,48 @@ def _remarks(seen: Sequence[_HeaderSeen]) -> list[str]:
     """Return the headers' remarks, and problems with what the captures don't state either, one line for all frames
     that have the same but for numbers."""
     texts: list[tuple[Path | str, str]] = []
-    for one in {one.file: one for one in seen}.values():
-        open_ones = [line for key, line in one.header.problems if getattr(one.capture, key) is None]
-        texts += [(one.file, text) for text in (*open_ones, *one.header.remarks)]
+    for frame in {frame.file: frame for frame in seen}.values():
+        open_ones = [line for key, line in frame.header.problems if getattr(frame.capture, key) is None]
+        texts += [(frame.file, text) for text in (*open_ones, *frame.header.remarks)]
     return join_alike(texts)
 
 
 def join_alike(texts: Sequence[tuple[Path | str, str]]) -> list[str]:
     """Return one line for all files with the same text but for numbers: the first file, its text, how many more, and
-    whether these have other numbers."""
-    found: dict[str, list[tuple[Path | str, str]]] = {}
+    whether these have other numbers.
+
+    texts : (file, text) of each
+
+    >>> join_alike([("a.fits", "EXPTIME 1 s"), ("b.fits", "EXPTIME 2 s")])
+    ['a.fits and 1 more: EXPTIME 1 s (others have other values)']
+    """
+    alike_texts: dict[str, list[tuple[Path | str, str]]] = {}
     for file, text in texts:
-        found.setdefault(re.sub(r"[\d.+-]+", "#", text), []).append((file, text))
+        alike_texts.setdefault(re.sub(r"[\d.+-]+", "#", text), []).append((file, text))
     return [
         f"{alike[0][0]}{f' and {len(alike) - 1} more' if len(alike) > 1 else ''}: {alike[0][1]}"
         f"{' (others have other values)' if len({text for _, text in alike}) > 1 else ''}"
-        for alike in found.values()
+        for alike in alike_texts.values()
     ]
 
 
 def _contradictions(
     manifest: Manifest, seen: Sequence[_HeaderSeen], images: Mapping[str, Path], where: str
 ) -> list[str]:
-    """Return the lines of `held_against_frames` on quantities."""
-    timed = [one for one in seen if one.capture.exposure_s is not None and one.header.exposure_s is not None]
-    off = [one for one in timed if not same_exposure(one.capture.exposure_s, one.header)]
+    """Return the lines of `check_against_frames` on quantities."""
+    timed = [frame for frame in seen if frame.capture.exposure_s is not None and frame.header.exposure_s is not None]
+    off = [frame for frame in timed if not same_exposure(frame.capture.exposure_s, frame.header)]
     if off and (unit := _unit(off)):
-        one = off[0]
+        first = off[0]
         raise InputError(
-            f"{one.file}: exposure_s = {one.capture.exposure_s:g} s, its {one.header.source} says "
-            f"{one.header.exposure_s:g} s{_and(off)}: "
+            f"{first.file}: exposure_s = {first.capture.exposure_s:g} s, its {first.header.source} says "
+            f"{first.header.exposure_s:g} s{_and(off)}: "
             f"it seems to be in {unit}; write seconds"
         )
-    confirmed = {one.capture.id for one in timed} - {one.capture.id for one in off}
+    confirmed = {frame.capture.id for frame in timed} - {frame.capture.id for frame in off}
     doubted = [c for c in manifest.captures if c.exposure_s is not None and c.id not in confirmed]
     _check_limit([c for c in doubted if c.exposure_s > LONGEST_S], images)
-    if moved := _moved(timed, off):
+    if moved := _find_shifted_rows(timed, off):
         raise InputError(
             f"{where}: {len(off)} of {len(timed)} exposures contradict their frames ({off[0].file.name}: "
             f"{off[0].capture.exposure_s:g} s, its "
@@ -391,19 +401,30 @@ def _contradictions(
             "move the column of the "
             "frames by one row"
         )
-    lines = [_said("exposure_s", "s", [(one, one.capture.exposure_s, one.header.exposure_s) for one in off])]
-    warm = [(one, one.capture.temperature_c, one.header.temperature_c) for one in seen]
-    lines.append(_said("temperature_c", "degree C", [one for one in warm if _differ(*one[1:], TEMPERATURE_C)]))
-    gains = [(one, one.capture.gain_db, one.header.gain_db) for one in seen]
-    lines.append(_said("gain_db", "dB", [one for one in gains if _differ(*one[1:], GAIN_DB)]))
+    lines = [
+        _difference_line(
+            "exposure_s", "s", [(frame, frame.capture.exposure_s, frame.header.exposure_s) for frame in off]
+        )
+    ]
+    warm = [(frame, frame.capture.temperature_c, frame.header.temperature_c) for frame in seen]
+    lines.append(
+        _difference_line(
+            "temperature_c", "degree C", [compared for compared in warm if _differ(*compared[1:], TEMPERATURE_C)]
+        )
+    )
+    gains = [(frame, frame.capture.gain_db, frame.header.gain_db) for frame in seen]
+    lines.append(_difference_line("gain_db", "dB", [compared for compared in gains if _differ(*compared[1:], GAIN_DB)]))
     lines += [_gain_of_some([c for c in manifest.captures if c.side == side], images) for side in manifest.cameras]
     for side, camera in manifest.cameras.items():
-        own = [one for one in seen if one.capture.side == side]
+        frames = [frame for frame in seen if frame.capture.side == side]
         f_number, key = camera.f_number, "f_number"
-        if f_number is None and (opened := [one for one in own if one.header.f_number is not None]):
+        if f_number is None and (opened := [frame for frame in frames if frame.header.f_number is not None]):
             f_number, key = opened[0].header.f_number, f"f_number (of {opened[0].file.name})"
-        wide = [(one, f_number, one.header.f_number) for one in own]
-        lines += [_said(key, "", [one for one in wide if not same_f_number(*one[1:])]), _uneven_gain(own)]
+        wide = [(frame, f_number, frame.header.f_number) for frame in frames]
+        lines += [
+            _difference_line(key, "", [compared for compared in wide if not same_f_number(*compared[1:])]),
+            _uneven_gain(frames),
+        ]
     return [line for line in (*lines, _long(doubted, images)) if line] + _overlapping(manifest.captures, images)
 
 
@@ -437,7 +458,11 @@ def same_exposure(stated_s: float | None, header: FrameHeader) -> bool:
 
 
 def same_f_number(stated: float | None, header: float | None) -> bool:
-    """Return whether two f-numbers are one marking; yes where one is unknown."""
+    """Return whether two f-numbers are one marking; yes where one is unknown.
+
+    >>> same_f_number(2.8, 2.83), same_f_number(2.8, 4.0), same_f_number(None, 4.0)
+    (True, False, True)
+    """
     return not stated or not header or max(stated / header, header / stated) <= F_NUMBER_FACTOR
 
 
@@ -448,21 +473,21 @@ def _differ(stated: float | None, header: float | None, allowed: float) -> bool:
 def _unit(off: Sequence[_HeaderSeen]) -> str | None:
     """Return the unit in which all these exposures are, where it isn't the second."""
     for factor, name in UNIT_FACTORS.items():
-        if all(same_exposure((one.capture.exposure_s or 0.0) / factor, one.header) for one in off):
+        if all(same_exposure((frame.capture.exposure_s or 0.0) / factor, frame.header) for frame in off):
             return name
     return None
 
 
-def _moved(timed: Sequence[_HeaderSeen], off: Sequence[_HeaderSeen]) -> str | None:
+def _find_shifted_rows(timed: Sequence[_HeaderSeen], off: Sequence[_HeaderSeen]) -> str | None:
     """Return the rows whose frames all exposures fit, where these aren't their own."""
     if len(timed) < FEWEST_ROWS or len(off) < FEWEST_OFF:
         return None
-    stated, taken = [one.capture.exposure_s for one in timed], [one.header for one in timed]
+    stated, taken = [frame.capture.exposure_s for frame in timed], [frame.header for frame in timed]
     for rows, pairs in (
         ("the next rows", zip(stated, taken[1:], strict=False)),
         ("the rows before", zip(stated[1:], taken, strict=False)),
     ):
-        if all(same_exposure(one, other) for one, other in pairs):
+        if all(same_exposure(exposure_s, header) for exposure_s, header in pairs):
             return rows
     return None
 
@@ -471,47 +496,47 @@ def _and(off: Sequence[object]) -> str:
     return f" (so do {len(off) - 1} more)" if len(off) > 1 else ""
 
 
-def _said(key: str, unit: str, off: Sequence[tuple[_HeaderSeen, float | None, float | None]]) -> str:
+def _difference_line(key: str, unit: str, off: Sequence[tuple[_HeaderSeen, float | None, float | None]]) -> str:
     """Return the line for a quantity of which frames, what is stated and what their files say differ; empty where none
     does."""
     if not off:
         return ""
-    (one, stated, header), of = off[0], f" {unit}" if unit else ""
+    (frame, stated, header), of = off[0], f" {unit}" if unit else ""
     return (
-        f"{one.file}: {key} = {stated:g}{of}, its {one.header.source} says {header:g}{of}{_and(off)}; the former is "
-        "used: correct what is wrong"
+        f"{frame.file}: {key} = {stated:g}{of}, its {frame.header.source} says {header:g}{of}{_and(off)}; the former "
+        "is used: correct what is wrong"
     )
 
 
-def _uneven_gain(own: Sequence[_HeaderSeen]) -> str:
+def _uneven_gain(frames: Sequence[_HeaderSeen]) -> str:
     """Return the line for frames of one side whose ISO speeds differ otherwise than their gains. Other ISO speeds at
     one gain are a difference of settings."""
-    known = [one for one in own if one.header.iso is not None]
+    known = [frame for frame in frames if frame.header.iso is not None]
     if not known:
         return ""
     first = known[0]
     iso, gain_db = first.header.iso or 1.0, first.capture.gain_db or 0.0
     off = [
-        one
-        for one in known
-        if (one.capture.gain_db or 0.0) != gain_db
-        and abs((one.capture.gain_db or 0.0) - gain_db - 20.0 * log10((one.header.iso or iso) / iso)) > GAIN_DB
+        frame
+        for frame in known
+        if (frame.capture.gain_db or 0.0) != gain_db
+        and abs((frame.capture.gain_db or 0.0) - gain_db - 20.0 * log10((frame.header.iso or iso) / iso)) > GAIN_DB
     ]
     if not off:
         return ""
-    one = off[0]
-    stated = "unknown" if one.capture.gain_db is None else f"{one.capture.gain_db:g} dB"
+    differing = off[0]
+    stated = "unknown" if differing.capture.gain_db is None else f"{differing.capture.gain_db:g} dB"
     return (
-        f"{one.file}: its {one.header.source} says ISO {one.header.iso:g} and that of {first.file.name} ISO {iso:g}, "
-        f"{20.0 * log10((one.header.iso or iso) / iso):+.1f} dB, but gain_db is {stated}{_and(off)}; write the gain "
-        "of each into the column gain_db"
+        f"{differing.file}: its {differing.header.source} says ISO {differing.header.iso:g} and that of "
+        f"{first.file.name} ISO {iso:g}, {20.0 * log10((differing.header.iso or iso) / iso):+.1f} dB, but gain_db is "
+        f"{stated}{_and(off)}; write the gain of each into the column gain_db"
     )
 
 
-def _gain_of_some(own: Sequence[Capture], images: Mapping[str, Path]) -> str:
+def _gain_of_some(captures: Sequence[Capture], images: Mapping[str, Path]) -> str:
     """Return the line for frames of one side that state no gain where others do; empty where there is none."""
-    without = [capture for capture in own if capture.gain_db is None]
-    gains = sorted({capture.gain_db for capture in own if capture.gain_db is not None})
+    without = [capture for capture in captures if capture.gain_db is None]
+    gains = sorted({capture.gain_db for capture in captures if capture.gain_db is not None})
     if not without or not any(gains):
         return ""
     return (
@@ -538,13 +563,14 @@ def _overlapping(captures: Sequence[Capture], images: Mapping[str, Path]) -> lis
     lines = []
     timed = [(c.time.timestamp(), c) for c in captures if c.time is not None and c.exposure_s is not None]
     for side in dict.fromkeys(c.side for _, c in timed):
-        own = sorted((one for one in timed if one[1].side == side), key=lambda one: one[0])
-        for (at_s, one), (later_s, other) in pairwise(own):
-            shorter_s = min(one.exposure_s, other.exposure_s)  # times are of the beginning or of the end of an exposure
-            if one.frame != other.frame and later_s - at_s + CLOCK_S < shorter_s * (1.0 - MEASURED_SHARE):
+        in_time = sorted(((at_s, c) for at_s, c in timed if c.side == side), key=itemgetter(0))
+        for (at_s, capture), (later_s, following) in pairwise(in_time):
+            # times are of the beginning or of the end of an exposure
+            shorter_s = min(capture.exposure_s, following.exposure_s)
+            if capture.frame != following.frame and later_s - at_s + CLOCK_S < shorter_s * (1.0 - MEASURED_SHARE):
                 lines.append(
-                    f"{images[one.frame]}: exposure_s = {one.exposure_s:g}, but {images[other.frame].name} of "
-                    f"{other.exposure_s:g} s was taken "
+                    f"{images[capture.frame]}: exposure_s = {capture.exposure_s:g}, but "
+                    f"{images[following.frame].name} of {following.exposure_s:g} s was taken "
                     f"{later_s - at_s:g} s later; check that exposures are in seconds, and the times"
                 )
                 break

@@ -447,7 +447,7 @@ def _check_frames(recordings: RecordingSet, found: Findings, loaded: Loaded) -> 
     for number, capture in enumerate(captures, start=1):
         camera = recordings.manifest.cameras[capture.side]
         try:
-            frame = recordings.frame(capture)
+            frame = recordings.whole_frame(capture)
         except InputError as error:
             found.problems.append(str(error))
             continue

@@ -180,7 +180,7 @@ class FolderFiles:
         return locate(self.root, path)
 
     def frame(self, path: str, camera: DataSheet) -> Frame:
-        return load_frame(locate(self.root, path), (camera.rows, camera.cols))
+        return load_frame(locate(self.root, path), camera.frame_shape)
 
     def spectrum(self, path: str) -> Spectrum:
         try:

@@ -30,8 +30,18 @@ MANIFEST = "manifest.json"
 def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None = None) -> RecordingSet:
     """Return the recording set in the folder `path`, or below a URL (`s3://bucket/set`), completely checked.
 
+    path : the folder, or its manifest.json
+    progress : called with a line of text when the captures are looked through
+
     Raises RecordingError (an InputError) with one line for everything that can't be used. Unknown keys, skipped kinds
     and the like stand in `.warnings`.
+
+    >>> import calibench
+    >>> calibench.write(calibench.open_recordings("my-camera"), "my-set").name
+    'my-set'
+    >>> recordings = calibench.read("my-set")
+    >>> recordings.sides
+    ('left',)
     """
     if is_url(path):
         return _read_url(str(path), progress)
@@ -122,7 +132,7 @@ def contents(recordings: RecordingSet) -> Iterator[tuple[str, bytes]]:
     for capture in recordings.manifest.captures:
         if capture.frame not in written:
             written.add(capture.frame)
-            yield capture.frame, _frame_content(recordings, capture.frame, recordings.frame(capture))
+            yield capture.frame, _frame_content(recordings, capture.frame, recordings.whole_frame(capture))
     yield from _rest(recordings)
     yield MANIFEST, manifest_json(recordings.manifest).encode()
 
@@ -135,11 +145,19 @@ def write(
     told: Callable[[list[str]], None] | None = None,
 ) -> Path:
     """Write a recording set as the folder `path`: completely, or not at all. Frames stay bit-exact; each is read once.
-    `progress` is called after each with its capture's id and the share of them, `told` with the warnings of the checks,
-    which `read` gives again.
 
-    Raises InputError where `path` exists and isn't an empty folder, and RecordingError where the set itself would be
-    refused by `read`.
+    recordings : the set
+    path : a new or an empty folder
+    progress : called after each frame with its capture's id and the share of them
+    told : called with the warnings of the checks, which `read` gives again
+
+    Returns the folder. Raises InputError where `path` exists and isn't an empty folder, and RecordingError where the
+    set itself would be refused by `read`.
+
+    >>> import calibench
+    >>> folder = calibench.write(calibench.open_recordings("my-camera"), "my-set")
+    >>> (folder / "manifest.json").is_file()
+    True
     """
     folder = Path(path)
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):

@@ -103,10 +103,10 @@ class CodeCounts:
     @classmethod
     def total(cls, parts: Iterable[CodeCounts]) -> CodeCounts:
         """Return the counts of several parts together."""
-        own = [cls.of(np.zeros(0, np.int64)), *parts]
-        codes, at = np.unique(np.concatenate([part.code_dn for part in own]), return_inverse=True)
+        all_parts = [cls.of(np.zeros(0, np.int64)), *parts]
+        codes, at = np.unique(np.concatenate([part.code_dn for part in all_parts]), return_inverse=True)
         number = np.zeros(len(codes), np.int64)
-        np.add.at(number, at, np.concatenate([part.number.astype(np.int64) for part in own]))
+        np.add.at(number, at, np.concatenate([part.number.astype(np.int64) for part in all_parts]))
         return cls(codes, _smallest(number))
 
     @classmethod
@@ -142,7 +142,7 @@ class FrameCodes:
         counts = np.zeros((len(CELLS), CODES), np.int64)
         _count(np.ascontiguousarray(frame, np.uint16), counts)
         digest = hashlib.blake2b(np.ascontiguousarray(frame).data, digest_size=16).digest() if with_digest else b""
-        return cls(tuple(CodeCounts.of(one) for one in counts), digest)
+        return cls(tuple(CodeCounts.of(count) for count in counts), digest)
 
     def moved(self, row: int, col: int) -> FrameCodes:
         """Return the codes of a part that begins at `row` and `col` of a frame, by the cells of that frame's mosaic."""
@@ -159,8 +159,8 @@ class FrameCodes:
         """
         if cfa == "MONO":
             return {"Y": (self.every,)}
-        found = {
+        cells_of_channel = {
             channel: tuple(cell for place in places if (cell := self.cells[CELLS.index(place)]).pixels)
             for channel, places in phases(cfa).items()
         }
-        return {channel: cells for channel, cells in found.items() if cells}
+        return {channel: cells for channel, cells in cells_of_channel.items() if cells}

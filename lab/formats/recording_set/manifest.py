@@ -9,15 +9,16 @@ import json
 import math
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self, get_args
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from lab.capture_kinds.base import CAPTURES, AnyCapture, Capture, Open
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import InputError, one_line
 from lab.plain_text import complaints_of, escaped
 from sim.camera import Cfa, Shutter, Side
+from sim.sensor.margins import NO_MARGINS, Margins
 
 #
 # The instruments say it themselves, before the first capture. Two snapshots are compared by `differences`.
@@ -101,10 +102,15 @@ MOST_PX = 1 << 15
 
 
 class DataSheet(Open):
-    """The manufacturer's data of one camera, which the fits test. None: not known."""
+    """The manufacturer's data of one camera, which the fits test. None: not known.
+
+    `rows`, `cols`: of the active area, which sees light. `margins`: masked pixels and overscan around it, which the
+    frames hold, too.
+    """
 
     rows: int = Field(gt=0, le=MOST_PX)
     cols: int = Field(gt=0, le=MOST_PX)
+    margins: Margins = NO_MARGINS
     pixel_pitch_um: float | None = Field(default=None, gt=0)
     fill_factor: float | None = Field(default=None, gt=0, le=1)
     cfa: Cfa
@@ -129,10 +135,25 @@ class DataSheet(Open):
     def _known_channels(cls, value: Any) -> Any:
         return {key: path for key, path in value.items() if path is not None} if isinstance(value, dict) else value
 
+    @model_validator(mode="after")
+    def _keeps_the_mosaic(self) -> Self:
+        before = self.margins.lines[0][0], self.margins.lines[1][0]
+        if self.cfa != "MONO" and any(number % 2 for number in before):
+            raise ValueError(
+                f"margins: {before[0]} rows and {before[1]} columns before the active area shift the colour filters; "
+                "give an even number of each"
+            )
+        return self
+
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of the colour channels, in the order R, G, B; `("Y",)` for a MONO sensor."""
         return ("Y",) if self.cfa == "MONO" else ("R", "G", "B")
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame, margins included."""
+        return self.margins.frame_shape(self.rows, self.cols)
 
     @property
     def saturation_dn(self) -> float:

@@ -19,6 +19,7 @@ from lab.formats.recording_set.frame_codes import FrameCodes
 from lab.formats.recording_set.manifest import DataSheet, Manifest
 from lab.shown import Tabular
 from sim.camera import Side
+from sim.sensor.margins import NO_MARGINS
 from sim.spectrum import Spectrum
 
 C = TypeVar("C", bound=Capture)
@@ -161,8 +162,18 @@ class RecordingSet(Tabular):
         raise InputError(f"{self.source}: no capture '{id}'; the manifest lists {len(self.manifest.captures)} others")
 
     def frame(self, capture: Capture) -> Frame:
-        """Raw DN of a capture: uint16 (rows, cols), read-only. Raises InputError where the file contradicts the
-        manifest."""
+        """Raw DN of a capture: uint16 (rows, cols) of the active area, read-only. Raises InputError where the file
+        contradicts the manifest."""
+        whole, camera = self.whole_frame(capture), self.camera(capture.side)
+        if whole.shape == (camera.rows, camera.cols):
+            return whole
+        frame = np.ascontiguousarray(camera.margins.active(whole))
+        frame.flags.writeable = False
+        return frame
+
+    def whole_frame(self, capture: Capture) -> Frame:
+        """Return the raw DN of a capture with its margins: uint16 (rows, cols), read-only; a frame that was stored
+        without them is its active area. Raises InputError where the file contradicts the manifest."""
         with self._lock:
             if capture.frame in self._cache:
                 self._cache.move_to_end(capture.frame)
@@ -255,10 +266,12 @@ class RecordingSet(Tabular):
 
 def frame_problem(frame: Frame, camera: DataSheet) -> str | None:
     """Why `frame` can't be a frame of `camera`, with the remedy; None where it can."""
-    if frame.shape != (camera.rows, camera.cols):
+    if frame.shape not in (camera.frame_shape, (camera.rows, camera.cols)):
+        rows, cols = camera.frame_shape
+        margins = "" if camera.margins == NO_MARGINS else " with the margins"
         return (
             f"{frame.shape[0]} x {frame.shape[1]} pixels (rows x cols), but the manifest says "
-            f"{camera.rows} x {camera.cols}; recapture, or correct rows and cols"
+            f"{rows} x {cols}{margins}; recapture, or correct rows and cols{margins and ', or margins'}"
         )
     highest, limit = int(frame.max()), 2**camera.bit_depth - 1
     if highest > limit:

@@ -50,7 +50,7 @@ class ParameterValue(Estimate):
         if self.interval is None or not self.std:
             return self.interval
         ends = (self.value - NORMAL_95 * self.std, self.value + NORMAL_95 * self.std)
-        apart = max(abs(one - other) for one, other in zip(ends, self.interval, strict=True))
+        apart = max(abs(end - bound) for end, bound in zip(ends, self.interval, strict=True))
         return self.interval if apart > SKEWED * self.std or not self.is_determined else None
 
 

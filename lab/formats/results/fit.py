@@ -645,7 +645,10 @@ class CameraFit(Frozen):
     def remarks(self) -> tuple[str, ...]:
         """What the recordings show beside the figures: repeats that drift first, then what the fits report."""
         parts = (part.remarks for part in (self.noise, self.spectral, self.geometry) if part is not None)
-        return (*(drift.statement for drift in self.repeat_drifts), *(remark for own in parts for remark in own))
+        return (
+            *(drift.statement for drift in self.repeat_drifts),
+            *(remark for remarks in parts for remark in remarks),
+        )
 
 
 class FitResult(Tabular, Frozen):

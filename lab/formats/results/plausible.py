@@ -170,13 +170,15 @@ def _of_noise(noise: NoiseFit, sheet: DataSheet) -> Iterator[str]:
         if line := limits.sentence(title, law.doubling_temperature_c, law.doubling_temperature_c_std, "C"):
             yield line
     if noise.quantum_efficiency is None:  # of a colour camera, whose planes may be dark in this light: of the best
-        planes = [(one.quantum_efficiency, name) for name, one in noise.emva1288.items() if one.quantum_efficiency]
+        planes = [
+            (figures.quantum_efficiency, name) for name, figures in noise.emva1288.items() if figures.quantum_efficiency
+        ]
         if planes:
             name = max(planes)[1]
             title = f"{plain_name('quantum_efficiency')} {name}"
-            one = noise.emva1288[name]
+            figures = noise.emva1288[name]
             if line := FIGURES["quantum_efficiency"].sentence(
-                title, one.quantum_efficiency or 0.0, one.quantum_efficiency_std
+                title, figures.quantum_efficiency or 0.0, figures.quantum_efficiency_std
             ):
                 yield line
 
@@ -200,20 +202,22 @@ def _of_curves(fit: SpectralFit) -> Iterator[str]:
 def _of_edges(curves: Sequence[MtfCurve], sheet: DataSheet) -> Iterator[str]:
     """Judge each channel's median edge: of many edges, the noise alone puts some above a limit."""
     for channel in dict.fromkeys(curve.channel for curve in curves):
-        found = []
+        excesses = []
         for curve in curves:
             if curve.channel == channel and curve.mtf50_cy_per_px is not None:
                 limit = highest_mtf50_cy_per_px(sheet, curve.angle_deg)
                 std = math.hypot(curve.mtf50_cy_per_px_std or 0.0, ESTIMATE_ERROR * limit)
-                found.append(((curve.mtf50_cy_per_px - limit) / std, curve.capture, curve.mtf50_cy_per_px, std, limit))
+                excesses.append(
+                    ((curve.mtf50_cy_per_px - limit) / std, curve.capture, curve.mtf50_cy_per_px, std, limit)
+                )
         peaks = [_peak_over_one(curve) for curve in curves if curve.channel == channel and curve.mtf]
         if peaks:
             _, capture, value, std = median_low(peaks)
             if line := FIGURES["mtf"].sentence(f"highest MTF {channel} of {capture}", value, std):
                 yield line
-        if not found:
+        if not excesses:
             continue
-        _, capture, value, std, limit = median_low(found)
+        _, capture, value, std, limit = median_low(excesses)
         limits = replace(FIGURES["mtf50_cy_per_px"], upper=min(limit, 1.0))
         if line := limits.sentence(f"{plain_name('mtf50_cy_per_px')} {channel} of {capture}", value, std, "cy/px"):
             yield line

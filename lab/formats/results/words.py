@@ -97,22 +97,31 @@ def _parts(figure: str) -> tuple[str, list[str]]:
 
 
 def plain_name(figure: str, place: str = "") -> str:
-    """Return the plain name of a figure: `MTF50, edge-1 G`, `focal length x`. A path without a declared field is its
-    own name.
+    """Return the plain name of a figure. A path without a declared field is its own name.
 
-    `place`: which number, of a figure of several.
+    figure : its path in a fit, words with blanks
+    place : which number, of a figure of several
+
+    >>> plain_name("noise channels G read_noise_e")
+    'temporal dark noise (read noise), G'
     """
     field, of = _parts(figure)
     if not field:
         return " ".join(part for part in (figure.replace("_", " "), place) if part)
-    one = PLACES.get((field, place))
-    if one is None:
-        one = f"{NAMES[field]} {place}".rstrip()
-    return ", ".join(part for part in (one, " ".join(of)) if part)
+    text = PLACES.get((field, place))
+    if text is None:
+        text = f"{NAMES[field]} {place}".rstrip()
+    return ", ".join(part for part in (text, " ".join(of)) if part)
 
 
 def unit_of(figure: str) -> str:
-    """Return the unit of a figure, "1" for a ratio."""
+    """Return the unit of a figure, "1" for a ratio.
+
+    figure : its path in a fit, words with blanks
+
+    >>> unit_of("noise read_noise_e")
+    'e'
+    """
     field = _parts(figure)[0]
     return next((unit for end, unit in _UNITS.items() if field.endswith(end)), "1")
 
@@ -125,14 +134,22 @@ MOST_DECIMALS = 9
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def shown_unit(unit: str) -> str:
-    """Return a unit as it is printed; empty for a ratio."""
+def format_unit(unit: str) -> str:
+    """Return a unit as it is printed; empty for a ratio.
+
+    >>> format_unit("um"), format_unit("1")
+    ('µm', '')
+    """
     return SHOWN_UNITS.get(unit, unit)
 
 
 def plain_number(value: float, digits: int) -> str:
     """Return a number with `digits` significant digits at most, and without a power of ten where it is from 1e-9 to
-    1e6."""
+    1e6.
+
+    >>> plain_number(0.38214, 3), plain_number(12345.6, 4)
+    ('0.382', '12,350')
+    """
     if value == 0.0 or not math.isfinite(value):
         return f"{value:g}"
     size = float(f"{abs(value):.{digits - 1}e}")
@@ -144,16 +161,24 @@ def plain_number(value: float, digits: int) -> str:
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
-def measured(
+def format_value(
     value: float, std: float | None = None, unit: str = "", interval: tuple[float, float] | None = None
 ) -> str:
     """Return `value ± std unit`, the standard deviation to two digits and the value to the same place.
 
-    Without a standard deviation the value has four digits. With an `interval` it reads `value (low to high) unit`.
+    value, std : in `unit`; without a standard deviation the value has four digits
+    interval : 95 % interval; with one it reads `value (low to high) unit`
+
+    Source: GUM, 7.2.6: two digits of an uncertainty suffice.
+
+    >>> format_value(0.38214, 0.0082, "DN/e")
+    '0.3821 ± 0.0082 DN/e'
+    >>> format_value(2.0, interval=(1.5, 3.25), unit="um")
+    '2 (1.5 to 3.25) µm'
     """
     if interval is not None:
         low, high = (plain_number(end, 3) for end in interval)
-        return f"{plain_number(value, 3)} ({low} to {high}) {shown_unit(unit)}".rstrip()
+        return f"{plain_number(value, 3)} ({low} to {high}) {format_unit(unit)}".rstrip()
     if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
         number = plain_number(value, 4)
     else:
@@ -165,7 +190,7 @@ def measured(
             power = math.floor(math.log10(max(abs(value), std)))
             decimals = max(place + power, 0)
             number = f"({value / 10.0**power:.{decimals}f} ± {std / 10.0**power:.{decimals}f}){_ten_to(power)}"
-    return f"{number} {shown_unit(unit)}".rstrip()
+    return f"{number} {format_unit(unit)}".rstrip()
 
 
 def _to_place(value: float, place: int) -> float:

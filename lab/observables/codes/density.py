@@ -7,7 +7,7 @@ it."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -15,12 +15,11 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import block_diag
 
-from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
-from lab.observables.codes.even_light import EvenLight, ExpectedCounts, LevelCounts, PatternSum, even_light
+from lab.observables.codes.even_light import EvenLight, ExpectedCounts, PatternSum, PlaneCounts
 from lab.observables.codes.landings import landings
-from lab.observables.dataset import Dataset, held_out_flats, held_out_of
+from lab.observables.dataset import CLIPPED_SHARE, Dataset, held_out_flats, held_out_of
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
 from sim.sensor import mosaic
@@ -41,7 +40,6 @@ DEGREE_BESIDE = 1
 STEP_COUNT = 3.0  # of each code about a place; the sum over a place has a hundred times as many
 COMB_FLOOR = 3e-4
 VARIANCE_FLOOR = 0.03  # of a chi2's number of codes
-FINE_FRAMES = 8  # frames, at most, over which the fine pattern of a plane is averaged
 #: Frequencies of the combs, cycles a code.
 COMBS = (1 / 2, 3 / 8, 1 / 4, 1 / 8)
 PARTS = 4  # of the range of codes, each with a chi2 of its own
@@ -130,52 +128,20 @@ def measure_code_density(dataset: Dataset) -> Observable:
     )  # fmt: skip
 
 
-_Plane = tuple[str, tuple[int, ...]]  # name of a plane of the mosaic, and its shape
-
-
-@dataclass(frozen=True)
-class _Pattern:
-    """A plane's fine pattern over the mean signal (rows, cols), and the sum of its departures from local means."""
-
-    fine: FloatArray | float
-    sum: PatternSum = field(default_factory=PatternSum)
-
-
-def _planes(dataset: Dataset, capture: Any) -> Iterator[tuple[_Plane, FloatArray]]:
-    """Yield the planes of a capture's frame."""
-    for name, plane in mosaic.planes(dataset.recordings.frame(capture), dataset.camera.cfa).items():
-        yield (name, plane.shape), np.asarray(plane, np.float32)
-
-
 @dataclass(frozen=True)
 class _Counts:
     """Counts of every code in some frames, (white level + 1,), and the counts that light and noise give an ideal
-    converter; `planes`: the levels of each plane of the mosaic of each frame."""
+    converter; `planes`: those of each plane of the mosaic in each setting."""
 
     count: FloatArray
     expected: FloatArray
     captures: list[str]
-    planes: list[list[LevelCounts]]
+    planes: list[PlaneCounts]
 
-    def take(self, dataset: Dataset, capture: Any, patterns: dict[_Plane, _Pattern]) -> list[tuple[_Plane, EvenLight]]:
-        """Add a capture's frame, and its planes' departures to `patterns`. Return the light of its planes."""
-        frame = dataset.recordings.frame(capture)
+    def add(self, frame: Any, capture: str) -> None:
+        """Add a frame's codes."""
         self.count[:] += np.bincount(frame.ravel(), minlength=len(self.count))[: len(self.count)]
-        self.captures.append(capture.id)
-        found = []
-        for key, plane in _planes(dataset, capture):
-            pattern = patterns.setdefault(key, _Pattern(0.0))
-            light, departures = even_light(plane, dataset, pattern.fine)
-            pattern.sum.add(departures, light.signal_dn)
-            found.append((key, light))
-        return found
-
-    def expect(self, levels: list[LevelCounts]) -> None:
-        """Add a plane's levels to what is expected."""
-        for first, number, table in levels:
-            last = min(first + table.shape[1], len(self.expected))
-            self.expected[first:last] += number * table[0, : last - first]
-        self.planes.append(levels)
+        self.captures.append(capture)
 
 
 def counted(dataset: Dataset) -> dict[bool, _Counts]:
@@ -189,29 +155,52 @@ def counted(dataset: Dataset) -> dict[bool, _Counts]:
         )
     size = int(dataset.camera.white_level_dn) + 1
     counts = {out: _Counts(np.zeros(size), np.zeros(size), [], []) for out in (False, True)}
-    out = set(dataset.once(held_out_flats))
-    groups = dataset.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
-    out |= set().union(*(held_out_of(g, i, len(groups)) for i, g in enumerate(groups))) if groups else set()
-    captures = [
-        capture
-        for kind in (FlatCapture, NarrowbandCapture)
-        for capture in dataset.recordings.captures(kind, dataset.side)
-        if not capture.gain_db
-    ]
-    sums: dict[_Plane, PatternSum] = {}
-    for capture in captures[:: -(-len(captures) // FINE_FRAMES) or 1]:
+    settings, out = _settings(dataset)
+    patterns: dict[_Plane, PatternSum] = {}
+    for capture in (capture for setting in settings for capture in setting):
         for key, plane in _planes(dataset, capture):
-            sums.setdefault(key, PatternSum()).add_plane(plane, dataset.noise.black)
-    patterns = {key: _Pattern(of.fine()) for key, of in sums.items()}
-    lights = [
-        (counts[capture.id in out], light)
-        for capture in captures
-        for light in counts[capture.id in out].take(dataset, capture, patterns)
-    ]
-    distributions = {key: pattern.sum.distribution() for key, pattern in patterns.items()}
-    for own, (key, light) in lights:
-        own.expect(list(light.levels(distributions[key])))
+            pattern = patterns.setdefault(key, PatternSum())
+            if _clipped_share(dataset, plane) < CLIPPED_SHARE:
+                pattern.add(plane, dataset.noise.black)
+    sensitivity = {key: pattern.sensitivity() for key, pattern in patterns.items()}
+    gain = dataset.noise.gain if dataset.noise.gain_is_known else None
+    for setting in settings:
+        lights: dict[tuple[bool, _Plane], EvenLight] = {}
+        for capture in setting:
+            is_out = capture.id in out
+            counts[is_out].add(dataset.recordings.frame(capture), capture.id)
+            for key, plane in _planes(dataset, capture):
+                own = sensitivity[key] if _clipped_share(dataset, plane) < 0.5 else 0.0
+                lights.setdefault((is_out, key), EvenLight(dataset.noise.black)).add(plane, own)
+        for (is_out, _), light in lights.items():
+            plane_counts = light.counts(gain, size)
+            counts[is_out].expected[:] += plane_counts.expected()
+            counts[is_out].planes.append(plane_counts)
     return counts
+
+
+def _settings(dataset: Dataset) -> tuple[list[list[Any]], set[str]]:
+    """Return the captures of even light without gain in dB, by setting, and the ids of those held out."""
+    flats = dataset.flat_levels()
+    narrow = dataset.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
+    out = set(dataset.once(held_out_flats))
+    out |= set().union(*(held_out_of(g, i, len(narrow)) for i, g in enumerate(narrow)))
+    settings = ([capture for capture in group if not capture.gain_db] for group in (*flats, *narrow))
+    return [setting for setting in settings if setting], out
+
+
+_Plane = tuple[str, tuple[int, ...]]  # name of a plane of the mosaic, and its shape
+
+
+def _planes(dataset: Dataset, capture: Any) -> Iterator[tuple[_Plane, FloatArray]]:
+    """Yield the planes of a capture's frame."""
+    for name, plane in mosaic.planes(dataset.recordings.frame(capture), dataset.camera.cfa).items():
+        yield (name, plane.shape), np.asarray(plane, np.float32)
+
+
+def _clipped_share(dataset: Dataset, plane: FloatArray) -> float:
+    """Share of a plane's pixels at the clipping level, which all sensitivities reach alike."""
+    return float(np.mean(plane >= dataset.saturation_dn))
 
 
 def counted_in_all(dataset: Dataset) -> dict[bool, _Counts]:
@@ -228,9 +217,7 @@ def counted_in_all(dataset: Dataset) -> dict[bool, _Counts]:
         if capture.kind in {"dark", "flat", "narrowband"} or getattr(capture, "gain_db", None):
             continue
         number[capture.kind] = number.get(capture.kind, -1) + 1
-        own, frame = found[number[capture.kind] % 3 == 1], dataset.recordings.frame(capture)
-        own.count[:] += np.bincount(frame.ravel(), minlength=len(own.count))[: len(own.count)]
-        own.captures.append(capture.id)
+        found[number[capture.kind] % 3 == 1].add(dataset.recordings.frame(capture), capture.id)
     return found
 
 
@@ -278,28 +265,14 @@ def _smoothing(half: int) -> FloatArray:
 def _covariance(linear: FloatArray, codes: CodeHistogram, counts: _Counts, light: ExpectedCounts) -> FloatArray:
     """Return the covariance (m, m) of `linear` (m, codes) @ counts less what is expected.
 
-    Each pixel has one code, with probabilities of its level and its fixed pattern: the counts are a sum of multinomial
-    ones. What is expected has its local means and each plane's mean square from the same pixels: it follows the counts
-    of neighbouring levels with their mean, and those of a plane with their mean square. These parts of the counts'
-    noise cancel, but for what the latter two differ in."""
+    Each pixel has one code, with the probabilities of its level: the counts are a sum of multinomial ones. What is
+    expected has its local means and each plane's mean square from the same pixels: it follows the counts of
+    neighbouring levels with their mean, and those of a plane with their mean square. These parts of the counts' noise
+    cancel."""
     covariance = (linear * np.maximum(codes.expected, 1.0)) @ linear.T
-    taken = [
-        linear[:, first : first + directions.shape[1]] @ directions.T
-        for levels in counts.planes
-        for first, directions in (_scatter_of(level, codes) for level in levels)
-    ]
-    table = np.concatenate([*taken, *(linear @ light.followed(row) for row in (3, 4))], axis=1)
-    brought = linear @ light.followed(5)
-    return covariance - table @ table.T + brought @ brought.T
-
-
-def _scatter_of(level: LevelCounts, codes: CodeHistogram) -> tuple[int, FloatArray]:
-    """Return a level's probabilities, and how they vary with the fixed pattern, times the root of its pixels' number:
-    the index of the first code in `codes`, and the values (n, codes)."""
-    low = max(level.first, codes.first)
-    high = max(min(level.first + level.table.shape[1], codes.first + len(codes.count)), low)
-    rows = level.table[[0, *range(6, len(level.table))], low - level.first : high - level.first]
-    return low - codes.first, np.sqrt(level.number) * rows
+    taken = [linear @ plane.scatter(codes.first, len(codes.count)).T for plane in counts.planes]
+    table = np.concatenate([*taken, *(linear @ part for part in light.followed())], axis=1)
+    return np.asarray(covariance - table @ table.T)
 
 
 def _combs(codes: CodeHistogram) -> tuple[FloatArray, list[tuple[float, str]]]:

@@ -4,139 +4,37 @@ follows a converter's law."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy import ndimage, sparse
-from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
 from lab.observables.codes.landings import MARGIN
-from lab.observables.dataset import Dataset
 from lab.observables.noise.surface import shading
 from sim.spectrum import FloatArray
 
 AROUND = 9  # side of the box in a plane of the mosaic whose mean is the light at a pixel, px
 #: Width of the levels whose pixels share one distribution, over the standard deviation of the noise.
 STEP_OF_LEVELS = 0.2
-#: Levels over which the noise of local means scatters neighbouring pixels: six standard deviations, of 1 / `AROUND` of
-#: the pixels' noise each.
+#: Levels of the local means that share one estimate: six standard deviations of the means' noise, which is 1 /
+#: `AROUND` of the pixels' noise.
 LEVELS_TOGETHER = round(6.0 / AROUND / STEP_OF_LEVELS) + 1
-BIN = 0.2  # of the fixed pattern's standard deviation: width of the bins of its distribution
-MOST_BINS = 100  # on either side
 OUTLYING = 5.0  # standard deviations from which on a pixel is an outlier
-LIMITED, SOLVED = 2, 8  # iterations of the limit of outliers, and of the variance that limited squares show
-PART_STEP = 0.01  # of the variance's part of the fixed pattern, in which its shape is looked up
+LIMITED = 2  # iterations of the limit of outliers
 LEAST_SQUARE = 1e-3  # DN^2
-LEAST_LEVEL = 0.05  # of the mean signal, to which departures are related
-LEAST_REST, MOST_OF_PATTERN = 0.05, 0.95  # of the variance
-#: Frames from which on the pattern's distribution is measured: of fewer, their own noise has too large a part in it.
+LEAST_VARIANCE = 1e-2  # DN^2, of the pixels of one level
+#: Frames from which on the pixels' sensitivities are measured: of fewer, their own noise is most of what is found.
 LEAST_FRAMES = 4
-ORDERS = 6  # of the polynomials of the fixed pattern by which the counts' noise is less than without it
-COARSER = 3  # box means after each other that leave the fine pattern out
-FARTHEST, GRID = 6.5, 1.0 / 16.0  # of the normalised departure: farthest, and spacing of its distribution's spline
+FARTHEST = 6.5  # of a departure over its standard deviation
 FOLLOWED, MOST_FOLLOWED = 4, 1.0  # iterations of `ExpectedCounts.change`; largest change of a mean over the noise
-
-
-class LevelCounts(NamedTuple):
-    """The pixels of one level in one plane: their first code, their number, and by code (6 + n, codes):
-
-    the probability (row 0); its change by one standard deviation of the mean (1), and by 1 / sqrt 2 of the variance
-    (2). Of the counts' noise a pixel, one standard deviation each: what goes with the pixel's mean (3), with its mean
-    square (4), and how far the latter is from what the change of the variance gives (5; 0 of a normal distribution).
-    How the probability depends on the pixel's fixed pattern, by its orthonormal polynomials (6 and following).
-    """
-
-    first: int
-    number: int
-    table: FloatArray
-
-
-class SensitivityPattern:
-    """Distribution of pixels' own sensitivities about the local mean, the same in all frames of a plane.
-
-    It is that of the pixels' mean departures over frames, over the mean signal. What noise these means have is normal,
-    as is what the noise of one frame has beyond it: their sum is spread as one frame is, whatever the pattern's own
-    distribution.
-    """
-
-    def __init__(self, departures: FloatArray) -> None:
-        """Take the mean departures (pixels,), over the mean signal."""
-        width = max(BIN * min(float(departures.std()), 1.4826 * float(np.median(np.abs(departures)))), 1e-12)
-        index = np.clip(np.rint(departures / width), -MOST_BINS, MOST_BINS).astype(int) + MOST_BINS
-        number = np.bincount(index)
-        at = np.flatnonzero(number)
-        self._share = number[at] / len(departures)
-        self._place = np.bincount(index, departures)[at] / number[at]
-        core = np.abs(self._place) < OUTLYING * width / BIN
-        #: Mean square of the departures but for outliers, over the square of the signal.
-        self.variance = float(self._share[core] @ np.square(self._place[core])) / float(self._share[core].sum())
-        # polynomials of the place, orthonormal over the pixels; the first is 1
-        limited = np.clip(self._place / (width / BIN), -OUTLYING, OUTLYING)
-        root = np.sqrt(self._share)[:, None]
-        basis, triangle = np.linalg.qr(root * np.vander(limited, min(ORDERS, len(at)), increasing=True))
-        self._orthonormal = np.zeros((len(at), ORDERS))
-        self._orthonormal[:, : basis.shape[1]] = basis * np.sign(np.diag(triangle)) / root
-        self._shapes: dict[int, CubicSpline] = {}
-
-    def rest_variance(self, light: EvenLight) -> float:
-        """Return the variance of the normal noise that, with the pattern, gives a plane's mean square of departures."""
-        own = np.maximum(light.middle - light.black_dn, 1.0)
-        place, limit = self._place * np.sqrt(np.average(np.square(own), weights=light.number)), light.limit_dn
-        rest = light.mean_square
-        for _ in range(SOLVED):
-            std = np.sqrt(rest)
-            high, low = (limit - place) / std, (-limit - place) / std
-            inside = ndtr(high) - ndtr(low)
-            edges = (limit + place) * _normal(high) + (limit - place) * _normal(low)
-            square = (np.square(place) + rest) * inside - std * edges + limit**2 * (1.0 - inside)
-            rest = max(rest + light.mean_square - float(self._share @ square), LEAST_REST * light.mean_square)
-        return rest
-
-    def shape(self, part: float) -> CubicSpline:
-        """Return, over the normalised departure z, the distribution function and its first three derivatives; its
-        changes of rows 4 and 5 of `LevelCounts`, and those with the pattern. The pattern has `part` of the variance,
-        normal noise the rest."""
-        key = round(part / PART_STEP)
-        if key not in self._shapes:
-            self._shapes[key] = self._shape(key * PART_STEP)
-        return self._shapes[key]
-
-    def _shape(self, part: float) -> CubicSpline:
-        place = self._place * np.sqrt(part / max(self.variance, 1e-300))
-        std = float(np.sqrt(1.0 - part))
-        z = np.linspace(-FARTHEST, FARTHEST, round(2.0 * FARTHEST / GRID) + 1)
-        u = (z[:, None] - place) / std
-        density = _normal(u)
-        slope = (-u * density / std**2) @ self._share
-        # of (place + std u)^2, given the place: its integral and its variance
-        square = -(std * (z[:, None] + place) * density) @ self._share
-        near = np.abs(place) < OUTLYING
-        of_square = float(self._share[near] @ (2.0 * std**4 + 4.0 * np.square(place[near]) * std**2))
-        columns = (
-            (density / std) @ self._share,
-            slope,
-            ((np.square(u) - 1.0) * density / std**3) @ self._share,
-            square / np.sqrt(of_square),
-            square / np.sqrt(of_square) - 0.5 * np.sqrt(of_square) * slope,
-        )
-        with_place = ndtr(u) @ (self._share[:, None] * self._orthonormal)
-        return CubicSpline(z, np.column_stack([with_place[:, 0], *columns, with_place[:, 1:]]))
-
-
-def _normal(z: FloatArray) -> FloatArray:
-    """Density of the standard normal distribution."""
-    return np.asarray(np.exp(-0.5 * np.square(z)) / np.sqrt(2.0 * np.pi))
-
-
-#: Of pixels that are all alike, or whose pattern isn't known: their departures are taken as normal.
-NO_PATTERN = SensitivityPattern(np.zeros(1))
 
 
 @dataclass
 class PatternSum:
-    """Sum of a plane's departures (pixels,) or (rows, cols) over frames, and of the frames' mean signals above black.
+    """Sum of a plane's departures from smooth light (rows, cols), DN, over frames, and of the frames' mean signals
+    above black.
 
     Shot noise is as large in the sum from each frame per root of its signal, as least squares demand.
     """
@@ -145,131 +43,139 @@ class PatternSum:
     signal_dn: float = 0.0
     number: int = 0
 
-    def add(self, departures: FloatArray, signal_dn: float) -> None:
-        """Add a frame."""
-        self.departures = self.departures + departures
-        self.signal_dn += signal_dn
-        self.number += 1
-
-    def add_plane(self, plane: Any, black_dn: float) -> None:
+    def add(self, plane: Any, black_dn: float) -> None:
         """Add a frame's plane (rows, cols) less its smooth surface and its rows' means."""
         own = plane - shading(plane)
-        self.add(own - own.mean(axis=1, keepdims=True), max(float(plane.mean()) - black_dn, 1.0))
+        own -= own.mean(axis=1, keepdims=True)
+        self.departures = self.departures + own
+        self.signal_dn += max(float(plane.mean()) - black_dn, 1.0)
+        self.number += 1
 
-    def distribution(self) -> SensitivityPattern:
-        """Return the pixels' distribution; that of pixels that are all alike from too few frames."""
-        if self.number < LEAST_FRAMES:
-            return NO_PATTERN
-        return SensitivityPattern(np.asarray(self.departures, float).ravel() / self.signal_dn)
-
-    def fine(self) -> FloatArray | float:
-        """Return what all frames have finer than local means, over the mean signal (rows, cols); 0 of too few.
-
-        Local means of what is left of a frame don't tell of its pixels' own sensitivities, which a defect or a pattern
-        as wide as their box would make them do.
-        """
-        if self.number < LEAST_FRAMES:
-            return 0.0
-        total = np.asarray(self.departures)
-        limit, _ = _limited(total)
-        coarse = np.clip(total, -limit, limit)
-        for _ in range(COARSER):
-            coarse = ndimage.uniform_filter(coarse, AROUND, mode="reflect")
-        return np.asarray((total - coarse) / self.signal_dn)
+    def sensitivity(self) -> FloatArray | float:
+        """Return the relative departure of each pixel's sensitivity (rows, cols); 0 of too few frames."""
+        return self.departures / self.signal_dn if self.number >= LEAST_FRAMES else 0.0
 
 
-@dataclass(frozen=True)
+@dataclass
 class EvenLight:
-    """The light in a plane by level (levels,): number of pixels, mean code, variance of the levels within it; and, of
-    the plane, the mean signal above black, the mean square of the departures from the local mean, limited to
-    `limit_dn`, and the gain, DN per electron."""
+    """The light in a plane of the mosaic over the frames of one setting.
 
-    number: FloatArray
-    middle: FloatArray
-    within: FloatArray
-    signal_dn: float
-    mean_square: float
-    limit_dn: float
-    gain: float
-    black_dn: float
-
-    def levels(self, pattern: SensitivityPattern) -> Iterator[LevelCounts]:
-        """Yield the pixels by level, of a plane with a fixed pattern.
-
-        The variance gives the measured mean square of the departures: so much are the codes spread about local means,
-        which have noise of their own. The pattern's is proportional to the signal's square, the rest's to the signal.
-        The distribution is that of the pattern with normal noise, and the skewness of Poisson numbers (Edgeworth's
-        first term).
-        """
-        rest = pattern.rest_variance(self)
-        for n, middle, added in zip(self.number, self.middle, self.within, strict=True):
-            own = max(middle - self.black_dn, 1.0)
-            of_pattern = pattern.variance * own**2
-            variance = max(of_pattern + rest * own / self.signal_dn + added, 1e-2)
-            sigma = np.sqrt(variance)
-            low = max(int(middle - 6.0 * sigma), 0)
-            edges = (np.arange(low, int(middle + 6.0 * sigma) + 3) - 0.5 - middle) / sigma
-            # Poisson numbers s in units of the gain K have the third central moment K^2 (K s)
-            skewness = self.gain**2 * own / sigma**3
-            of_pattern = min(of_pattern / variance, MOST_OF_PATTERN)
-            whole, density, slope, bend, *others = pattern.shape(of_pattern)(np.clip(edges, -FARTHEST, FARTHEST)).T
-            table = (
-                whole - skewness / 6.0 * bend,
-                -density,
-                slope / np.sqrt(2.0),
-                -np.sqrt(1.0 - of_pattern) * density,
-                *others,
-            )
-            yield LevelCounts(low, int(n), np.diff(np.array(table)))
-
-
-def even_light(plane: Any, dataset: Dataset, fine: FloatArray | float) -> tuple[EvenLight, FloatArray]:
-    """Return the light of a plane (rows, cols), and its pixels' departures from it (pixels,), DN at the mean signal.
-
-    A pixel's expected code is the local mean over `AROUND` x `AROUND` pixels without the `fine` pattern (rows, cols),
-    relative to the mean signal, and as much beside it as its row is on the whole. The smooth surface is taken off
-    first, as means at a frame's border would be wrong by its slope.
+    Pixels are counted by their level, in steps of `step_dn`, and by the group of levels of the local mean about them:
+    of one frame the `cells` have these two numbers, the number of pixels, and the sums of their levels above the step's
+    lower border and of its squares. `mean_square` is that of the departures from the level, at a mean signal of
+    `signal_dn`; both are sums over `frames`.
     """
-    smooth = shading(plane)
-    fixed = fine * max(float(smooth.mean()) - dataset.noise.black, 1.0)
-    own = plane - smooth - fixed
-    around = ndimage.uniform_filter(own, AROUND, mode="reflect")
-    rest = own - around
-    rest -= rest.mean(axis=1, keepdims=True)
-    # the fine pattern's noise, and a pattern that isn't known, are in the local means: these would tell of departures
-    rest -= float(np.vdot(rest, around)) / max(float(np.vdot(around, around)), 1e-12) * around
-    departures = rest + fixed
-    surface = plane - departures
-    noise = dataset.noise
-    signal = max(float(surface.mean()) - noise.black, 1.0)
-    limit, mean_square = _limited(departures)
-    # where no gain is known, that of shot noise alone
-    gain = noise.gain if noise.gain_is_known else mean_square / signal
-    # pixels are binned by level, in steps narrow beside the noise; the variance of the levels within a bin is added
-    step = max(STEP_OF_LEVELS * np.sqrt(mean_square), 1.0)
-    lowest = float(surface.min())
-    above = surface.ravel().astype(float) - lowest
-    group = (above / step).astype(int)
-    number = np.bincount(group).astype(float)
-    share = np.maximum(number, 1.0)
-    mean = np.bincount(group, above) / share
-    within = np.maximum(np.bincount(group, np.square(above)) / share - np.square(mean), 0.0)
-    of = number > 0
-    light = EvenLight(
-        number[of], mean[of] + lowest, within[of], signal, mean_square, limit, gain, black_dn=noise.black
-    )  # fmt: skip
-    return light, (departures * (signal / np.maximum(surface - noise.black, LEAST_LEVEL * signal))).ravel()
+
+    black_dn: float
+    step_dn: float = 0.0
+    mean_square: float = 0.0
+    signal_dn: float = 0.0
+    frames: int = 0
+    cells: list[FloatArray] = field(default_factory=list)
+
+    def add(self, plane: Any, sensitivity: FloatArray | float) -> None:
+        """Add a frame's plane (rows, cols), whose pixels have a relative `sensitivity` (rows, cols) beyond 1.
+
+        A pixel's level is the smooth surface and the local mean over `AROUND` x `AROUND` pixels, and as much beside it
+        as its row is on the whole, times the pixel's own sensitivity. Local means are those without the sensitivities,
+        whose defects and coarse patterns they would blur. The smooth surface is taken off first, as means at a frame's
+        border would be wrong by its slope.
+
+        The sensitivities have a part of this frame's noise, 1 / n of n frames. It spreads the levels, and the
+        departures from these have as much less: both together are spread as the frame is.
+        """
+        smooth = shading(plane)
+        fixed = sensitivity * max(float(smooth.mean()) - self.black_dn, 1.0)
+        own = plane - smooth - fixed
+        around = ndimage.uniform_filter(own, AROUND, mode="reflect")
+        departures = own - around
+        departures -= departures.mean(axis=1, keepdims=True)
+        # a pattern that isn't known is in the local means: these would tell of departures
+        departures -= float(np.vdot(departures, around)) / max(float(np.vdot(around, around)), 1e-12) * around
+        surface = plane - departures
+        mean_square = _limited_square(departures)
+        self.mean_square += mean_square
+        self.signal_dn += max(float(surface.mean()) - self.black_dn, 1.0)
+        self.frames += 1
+        self.step_dn = self.step_dn or max(STEP_OF_LEVELS * float(np.sqrt(mean_square)), 1.0)
+        self.cells.append(_cells(surface, surface - fixed, self.step_dn))
+
+    def counts(self, gain: float | None, codes: int) -> PlaneCounts:
+        """Return the counts that the light gives at `codes` codes from 0 on.
+
+        The departures' mean square is proportional to the signal. They are normal, with the skewness of Poisson numbers
+        (Edgeworth's first term). `gain`, DN per electron; None: that of shot noise alone.
+        """
+        signal, mean_square = self.signal_dn / self.frames, self.mean_square / self.frames
+        gain = mean_square / signal if gain is None else gain
+        group, level, number, above, square = np.concatenate(self.cells, axis=1)
+        own, at = np.unique(level, return_inverse=True)
+        pixels: FloatArray = np.bincount(at, number).astype(float)
+        mean = np.bincount(at, above) / pixels
+        within = np.maximum(np.bincount(at, square) / pixels - np.square(mean), 0.0)
+        middle = own * self.step_dn + mean
+        light = np.maximum(middle - self.black_dn, 1.0)
+        sigma = np.sqrt(np.maximum(mean_square * light / signal + within, LEAST_VARIANCE))
+        low = np.maximum((middle - 6.0 * sigma).astype(int), 0)
+        code = low[:, None] + np.arange(int(12.0 * sigma.max()) + 4)
+        z = np.clip((code - 0.5 - middle[:, None]) / sigma[:, None], -FARTHEST, FARTHEST)
+        density = np.exp(-0.5 * np.square(z)) / np.sqrt(2.0 * np.pi)
+        # Poisson numbers s in units of the gain K have the third central moment K^2 (K s)
+        skewness = (gain**2 * light / sigma**3)[:, None]
+        below = (ndtr(z) - skewness / 6.0 * (np.square(z) - 1.0) * density, -density, -z * density / np.sqrt(2.0))
+        inside = code[:, :-1] < codes
+        row, column = np.nonzero(inside)[0], code[:, :-1][inside]
+        tables = tuple(sparse.csr_array((np.diff(of)[inside], (row, column)), shape=(len(own), codes)) for of in below)
+        first = group.min()
+        by_group = sparse.csr_array((number, ((group - first).astype(int), at)))
+        return PlaneCounts(tables, pixels, by_group)
 
 
-def _limited(departures: FloatArray) -> tuple[float, float]:
-    """Return the departure from which on pixels are outliers, `OUTLYING` standard deviations, and the mean square of
-    departures that are limited to it."""
+def _cells(surface: FloatArray, local: FloatArray, step_dn: float) -> FloatArray:
+    """Return the cells of `EvenLight` (5, cells): pixels by their level and by the group of their local mean."""
+    level = np.maximum(surface.ravel() / step_dn, 0.0)
+    index = level.astype(np.int64)
+    group = np.maximum(local.ravel() / (LEVELS_TOGETHER * step_dn), 0.0).astype(np.int64)
+    first, begin = int(index.min()), int(group.min())
+    width = int(index.max()) - first + 1
+    both = (group - begin) * width + index - first
+    above = (level - index) * step_dn
+    number = np.bincount(both)
+    at = np.flatnonzero(number)
+    sums = (np.bincount(both, weights)[at] for weights in (above, np.square(above)))
+    return np.array((at // width + begin, at % width + first, number[at], *sums), float)
+
+
+def _limited_square(departures: FloatArray) -> float:
+    """Return the mean square of departures that are limited to `OUTLYING` standard deviations."""
     square = np.square(departures)
     mean_square = max(float(np.mean(square, dtype=float)), LEAST_SQUARE)
     for _ in range(LIMITED):
-        limit = OUTLYING * float(np.sqrt(mean_square))
-        mean_square = max(float(np.mean(np.minimum(square, limit**2), dtype=float)), LEAST_SQUARE)
-    return limit, mean_square
+        mean_square = max(float(np.mean(np.minimum(square, OUTLYING**2 * mean_square), dtype=float)), LEAST_SQUARE)
+    return mean_square
+
+
+@dataclass(frozen=True)
+class PlaneCounts:
+    """Counts that the light in a plane of the mosaic gives an ideal converter over the frames of one setting.
+
+    `tables`: three of (levels, codes), for a pixel of each level: the probability of each code; its change by one
+    standard deviation of the mean; and by 1 / sqrt 2 of the variance. The latter two are also the parts of the counts'
+    noise that go with a pixel's mean and with its mean square, one standard deviation each. `number` (levels,): of
+    pixels. `by_group` (groups, levels): of pixels, by the local means that share an estimate.
+    """
+
+    tables: tuple[sparse.csr_array, ...]
+    number: FloatArray
+    by_group: sparse.csr_array
+
+    def expected(self) -> FloatArray:
+        """Return the counts (codes,)."""
+        return np.asarray(self.number @ self.tables[0])
+
+    def scatter(self, first: int, size: int) -> sparse.csr_array:
+        """Return the probabilities (levels, size) at codes from `first` on, times the root of the pixels' number."""
+        return sparse.csr_array(sparse.diags_array(np.sqrt(self.number)) @ self.tables[0][:, first : first + size])
 
 
 @dataclass(frozen=True)
@@ -277,7 +183,7 @@ class ExpectedCounts:
     """Counts that light and noise give an ideal converter, by groups of neighbouring levels of a plane whose local
     means are of the same pixels.
 
-    `tables`: six of (groups, cells), the sums of the pixels' `LevelCounts.table`; a cell is the input of an ideal
+    `tables`: three of (groups, cells), the sums of the pixels' `PlaneCounts.tables`; a cell is the input of an ideal
     code, of which `MARGIN` lie on either side of the codes that are counted. `plane`, `number`, `middle` (groups,):
     index of the plane, number of pixels, mean code less the first cell's. `by_mean`, `by_spread` (groups,): change of
     the sum of departures by the second table, and of their squares by the third.
@@ -291,43 +197,37 @@ class ExpectedCounts:
     by_spread: FloatArray
 
     @classmethod
-    def of(cls, planes: Sequence[Sequence[LevelCounts]], first: int, size: int) -> ExpectedCounts:
+    def of(cls, planes: Sequence[PlaneCounts], first: int, size: int) -> ExpectedCounts:
         """Return the counts of planes at `size` codes from `first` on."""
         begin, cells = first - MARGIN, size + 2 * MARGIN
-        values: list[FloatArray] = []
-        columns, counted, rows = [], [0], []
-        for plane, levels in enumerate(planes):
-            for k in range(0, len(levels), LEVELS_TOGETHER):
-                members = levels[k : k + LEVELS_TOGETHER]
-                low = min(level.first for level in members)
-                table = np.zeros((6, max(level.first + level.table.shape[1] for level in members) - low))
-                for level in members:
-                    at = level.first - low
-                    table[:, at : at + level.table.shape[1]] += level.number * level.table[:6]
-                code = np.arange(table.shape[1]) + low - begin
-                number = sum(level.number for level in members)
-                middle = float(code @ table[0]) / number
-                away = code - middle
-                rows.append((plane, number, middle, away @ table[1], np.square(away) @ table[2]))
-                inside = (code >= 0) & (code < cells)
-                values.append(table[:, inside])
-                columns.append(code[inside])
-                counted.append(counted[-1] + int(inside.sum()))
-        value, column, pointer = np.concatenate(values, axis=1), np.concatenate(columns), np.array(counted)
-        shape = len(rows), cells
-        tables = tuple(sparse.csr_array((one, column, pointer), shape=shape) for one in value)
-        return cls(tables, *np.array(rows, float).T)
+        parts: list[list[sparse.coo_array]] = [[], [], []]
+        rows: list[FloatArray] = []
+        for index, plane in enumerate(planes):
+            tables = [sparse.csr_array(plane.by_group @ table) for table in plane.tables]
+            number = np.asarray(plane.by_group.sum(axis=1))
+            kept = number > 0.0
+            tables, number = [table[kept] for table in tables], number[kept]
+            code = np.arange(tables[0].shape[1]) - float(begin)
+            middle = tables[0] @ code / number
+            by_mean = tables[1] @ code - middle * tables[1].sum(axis=1)
+            second = tables[2] @ np.square(code) - 2.0 * middle * (tables[2] @ code)
+            by_spread = second + np.square(middle) * tables[2].sum(axis=1)
+            rows.append(np.array((np.full(len(number), index), number, middle, by_mean, by_spread)))
+            for part, table in zip(parts, tables, strict=True):
+                part.append(_shifted(table, begin, cells))
+        together = tuple(sparse.csr_array(sparse.vstack(part)) for part in parts)
+        return cls(together, *np.concatenate(rows, axis=1))
 
-    def followed(self, row: int) -> FloatArray:
-        """Return the parts (codes, n) of the counts' noise, one standard deviation each, by a row of
-        `LevelCounts.table`: that the estimates follow, of each group's mean (3) and of each plane's mean square (4),
-        and that these bring (5)."""
-        table, number = self.tables[row], self.number
-        if row > 3:
-            of_plane = self.plane[None, :] == np.unique(self.plane)[:, None]
-            table, number = sparse.csr_array(of_plane.astype(float)) @ table, of_plane @ number
-        scaled = sparse.diags_array(1.0 / np.sqrt(number)) @ table
-        return np.asarray(scaled.toarray().T[MARGIN:-MARGIN])
+    def followed(self) -> Iterator[FloatArray]:
+        """Yield the parts (codes, n) of the counts' noise, one standard deviation each, that the estimates follow: of
+        each group's mean, and of each plane's mean square."""
+        of_plane = sparse.csr_array((self.plane[None, :] == np.unique(self.plane)[:, None]).astype(float))
+        for table, number in (
+            (self.tables[1], self.number),
+            (of_plane @ self.tables[2], of_plane @ self.number),
+        ):
+            scaled = sparse.diags_array(1.0 / np.sqrt(number)) @ table
+            yield np.asarray(scaled.toarray().T[MARGIN:-MARGIN])
 
     def change(self, lands: sparse.csr_array) -> FloatArray:
         """Return the change (codes,) of counts less what is estimated, by a converter with `landings`.
@@ -341,7 +241,7 @@ class ExpectedCounts:
         mass = np.maximum(np.bincount(found.coords[1], found.data, cells), 1e-12)
         moved = np.bincount(found.coords[1], found.data * away, cells) / mass
         square = np.bincount(found.coords[1], found.data * np.square(away), cells) / mass
-        sums = np.array([(t @ moved, t @ (2.0 * np.arange(cells) * moved + square)) for t in self.tables[:3]])
+        sums = np.array([(t @ moved, t @ (2.0 * np.arange(cells) * moved + square)) for t in self.tables])
         mean, second = sums[:, 0], sums[:, 1] - 2.0 * self.middle * sums[:, 0]
         plane = self.plane.astype(int)
         shift, wider = np.zeros(len(plane)), np.zeros(len(plane))
@@ -352,7 +252,16 @@ class ExpectedCounts:
             left = np.bincount(plane, second[0] + shift * second[1] + of_shift * by_wider)
             common = -left / np.maximum(np.bincount(plane, by_wider), 1e-12)
             wider = of_shift + np.clip(common, -MOST_FOLLOWED, MOST_FOLLOWED)[plane]
-        even, by_shift, by_wider = self.tables[:3]
+        even, by_shift, by_wider = self.tables
         ideal = even.sum(axis=0)
         given = lands @ (ideal + by_shift.T @ shift + by_wider.T @ wider)
         return np.asarray((given - ideal)[MARGIN:-MARGIN])
+
+
+def _shifted(table: sparse.csr_array, begin: int, cells: int) -> sparse.coo_array:
+    """Return the columns of a table (n, codes) from code `begin` on, `cells` of them; 0 where there is no code."""
+    row, column = table.tocoo().coords
+    inside = (column >= begin) & (column < begin + cells)
+    return sparse.coo_array(
+        (table.tocoo().data[inside], (row[inside], column[inside] - begin)), shape=(table.shape[0], cells)
+    )

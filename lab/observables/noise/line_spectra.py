@@ -15,6 +15,9 @@ from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 
 LEVEL_BAND = 0.04, 0.2  # cy/px, along both axes: frequencies over which the power of white noise is averaged
+#: Powers above this multiple of the level are tones, and no part of it. Powers of noise are exponentially distributed:
+#: a share exp(-16) = 1e-7 is above, with 17 exp(-16) = 2e-6 of the power.
+LARGEST_POWER = 16.0
 
 
 @dataclass(frozen=True)
@@ -27,12 +30,14 @@ class Periodogram:
 
     @property
     def _level(self) -> FloatArray:
-        """The powers in `LEVEL_BAND`."""
+        """The powers in `LEVEL_BAND`, without those of tones."""
         low, high = LEVEL_BAND
         inside = ((np.abs(self.rows) >= low) & (np.abs(self.rows) <= high))[:, None] & (
             (self.cols >= low) & (self.cols <= high)
         )[None, :]
-        return self.table[inside]
+        powers = self.table[inside]
+        # the median of an exponential distribution is ln 2 of its mean
+        return powers[powers <= LARGEST_POWER / np.log(2.0) * np.median(powers)]
 
     @property
     def level(self) -> float:

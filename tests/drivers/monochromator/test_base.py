@@ -12,7 +12,7 @@ from drivers.errors import InstrumentError
 from drivers.monochromator.base import (
     ORDER_SORTING_FILTERS,
     OrderSortingFilter,
-    checked_wavelength_nm,
+    check_wavelength_nm,
     filter_place,
     order_sorting_filters,
 )
@@ -63,7 +63,7 @@ def test_a_table_that_cannot_be_used_is_refused(table: list[object], complaint: 
 @pytest.mark.parametrize("wavelength_nm", [-1.0, 1400.1, math.nan, math.inf])
 def test_wavelengths_out_of_range_are_refused(wavelength_nm: float) -> None:
     with pytest.raises(InstrumentError, match=r"outside 0\.\.1400 nm"):
-        checked_wavelength_nm(wavelength_nm, 1400.0)
+        check_wavelength_nm(wavelength_nm, 1400.0)
 
 
 @pytest.mark.parametrize("made", [Cornerstone260, Cornerstone260B])

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from scipy import stats
 
 from lab.calibration import life
-from lab.calibration.limits import CalibrationLimits, Figure, Limit, figures_of, judged, read_limits
+from lab.calibration.limits import CalibrationLimits, Figure, Limit, figures_of, judge_figures, read_limits
 from lab.capture.plan import CapturePlan
 from lab.capture.records import RunRecord, now
 from lab.capture.session import CaptureSession
@@ -103,9 +103,9 @@ def test_figures_are_all_numbers_with_an_uncertainty_but_curves() -> None:
 def test_a_figure_is_judged_with_its_uncertainty(value: float, std: float, mark: str) -> None:
     limit = Limit(figure="noise *", side="left", good=(1.0, 2.5), warn=(0.9, 3.0))
     figure = Figure(name="noise read_noise_e", side="left", value=value, std=std)
-    assert [one.mark for one in judged((figure,), CalibrationLimits(limit=(limit,)))] == [mark]
+    assert [one.mark for one in judge_figures((figure,), CalibrationLimits(limit=(limit,)))] == [mark]
     other = figure.model_copy(update={"side": "right"})
-    assert [one.mark for one in judged((other,), CalibrationLimits(limit=(limit,)))] == ["missing"]
+    assert [one.mark for one in judge_figures((other,), CalibrationLimits(limit=(limit,)))] == ["missing"]
 
 
 @pytest.mark.parametrize(
@@ -436,7 +436,7 @@ def test_limits_are_drafted_from_what_is_usual(store: Store) -> None:
     for value in (2.0, 2.1, 2.2, 2.3):
         calibrated(store, value)
     newest = calibrated(store, 5.0)
-    found, whence = life.drafted_limits(store, newest)
+    found, whence = life.draft_limits(store, newest)
     assert len(whence) == 4 and newest not in whence
     limit = next(one for one in found if one.figure == "noise read_noise_e" and one.side == "left")
     half = float(stats.t.ppf(0.995, 3)) * float(np.std([2.0, 2.1, 2.2, 2.3], ddof=1)) * math.sqrt(1.25) + 2.0 * STD
@@ -446,7 +446,7 @@ def test_limits_are_drafted_from_what_is_usual(store: Store) -> None:
     sharp = next(one for one in found if "mtf50" in one.figure)
     assert sharp.figure == "mtf * mtf50_cy_per_px" and sharp.good[1] is None
     single = calibrated(store, 2.0, {"left": "X1", "right": "X2"})
-    alone, whence = life.drafted_limits(store, single)
+    alone, whence = life.draft_limits(store, single)
     assert whence == (single,) and alone
     # Whoever sends them, the certificate keeps that they aren't independent; not of limits that a laboratory set.
     own = life.certify(store, single, "Ada", CalibrationLimits(limit=alone))

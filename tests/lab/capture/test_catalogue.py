@@ -14,7 +14,7 @@ from lab.capture.catalogue import (
     TYPICAL_S,
     StepTimes,
     catalogue,
-    described,
+    describe_sequence,
     estimate,
     parse_parameters,
     step_times,
@@ -35,7 +35,7 @@ DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
 
 def test_every_sequence_is_listed_with_what_it_declares() -> None:
     for told, kind in zip(catalogue(), SEQUENCES.values(), strict=True):
-        assert told == described(kind.name) and told.purpose and told.capture_kinds
+        assert told == describe_sequence(kind.name) and told.purpose and told.capture_kinds
         assert [one.name for one in told.parameters] == list(read_quantities(kind))
         for one in told.parameters:
             quantity = read_quantities(kind)[one.name]
@@ -46,7 +46,7 @@ def test_every_sequence_is_listed_with_what_it_declares() -> None:
         "levels",
     }
     with pytest.raises(InputError, match="no sequence 'magic'; there are dark"):
-        described("magic")
+        describe_sequence("magic")
 
 
 def test_parameters_replace_those_of_a_full_session() -> None:
@@ -109,7 +109,7 @@ def test_times_are_learned_as_a_constant_and_a_slope() -> None:
     steps = DarkSequence(exposures_s=(0.5, 2.0, 5.0), frames=2).steps(STATION)
     others = full_plan(STATION, only=("flat",)).steps(STATION)
     seen = [(step, 0.3 + 1.1 * float(step.id.split("/")[1][:-1])) for step in steps] + [(step, 2.0) for step in others]
-    times = StepTimes.learned(seen)
+    times = StepTimes.learn(seen)
     assert times.per_exposure == pytest.approx(1.1)
     longer = DarkSequence(exposures_s=(10.0,), frames=1).steps(STATION)[0]
     assert times.seconds(longer) == (pytest.approx(0.3 + 11.0), True)

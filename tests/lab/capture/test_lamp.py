@@ -287,7 +287,7 @@ def test_a_lamp_that_a_crash_left_lit_goes_dark_at_the_next_start(
     monkeypatch.setattr("lab.capture.safe_at_start.driver", driver)
     rescue = Rescue(store.root)
     rescue.stop_others(30.0)
-    safe = rescue.made_safe(30.0)
+    safe = rescue.wait_until_safe(30.0)
     assert list(safe) == [session.id]  # the lights of the station file are no setting of the driver
     assert bench.lamp.shares == dict.fromkeys(bench.lamp.shares, 0.0)
     for lock in safe.values():

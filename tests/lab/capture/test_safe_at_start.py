@@ -48,7 +48,7 @@ def rescued(root: Path, patience_s: float = PATIENCE_S) -> list[str]:
     """The sessions whose stations were made safe; their locks are released."""
     rescue = Rescue(root)
     rescue.stop_others(patience_s)
-    safe = rescue.made_safe(patience_s)
+    safe = rescue.wait_until_safe(patience_s)
     for lock in safe.values():
         lock.release()
     return list(safe)
@@ -59,7 +59,7 @@ def test_the_station_is_made_safe_and_the_rest_is_left_to_the_recovery(store: St
     rescue = Rescue(store.root)
     assert "connect" not in bench.log and not any("camera" in line for line in bench.log)  # the shutter first
     rescue.stop_others(PATIENCE_S)
-    safe = rescue.made_safe(PATIENCE_S)
+    safe = rescue.wait_until_safe(PATIENCE_S)
     assert list(safe) == [session_id]
     assert not bench.opened and not bench.lit
     who = ("monochromator", "display", "stage", "spectroradiometer", "camera left", "camera right")
@@ -79,7 +79,7 @@ def test_locks_that_no_recovery_looked_at_are_released(store: Store, bench: Benc
     session_id = left_behind(store)
     rescue = Rescue(store.root)
     rescue.stop_others(PATIENCE_S)
-    Recovery(store, bench.drivers, made_safe=rescue.made_safe(PATIENCE_S)).close()
+    Recovery(store, bench.drivers, made_safe=rescue.wait_until_safe(PATIENCE_S)).close()
     assert store.lock(session_id).acquire(patience_s=0.0)
 
 
@@ -175,7 +175,7 @@ def test_the_start_looks_into_the_folder_that_the_service_will_use(
         monkeypatch.setenv("CALIBENCH_DATA", environment)
     monkeypatch.chdir(tmp_path)
     start.make_safe_at_start(arguments)
-    assert looked == [Path(folder)] and start.made_safe_at_start() == {}
+    assert looked == [Path(folder)] and start.wait_until_safe_at_start() == {}
     monkeypatch.setenv("CALIBENCH_DATABASE_URL", "postgresql://elsewhere")
     start.make_safe_at_start(arguments)
     assert len(looked) == 1  # left to the recovery
@@ -197,7 +197,7 @@ def test_the_service_is_loaded_while_the_instrument_answers(
     start.make_safe_at_start(["serve", "--data", str(store.root)])
     assert not bench.opened and not answers.is_set()
     answers.set()
-    safe = start.made_safe_at_start()
+    safe = start.wait_until_safe_at_start()
     assert list(safe) == [session_id]
     safe[session_id].release()
     shutter, whole = capsys.readouterr().err.splitlines()

@@ -15,7 +15,7 @@ from lab.capture.session import CaptureSession
 from lab.capture.station import Station
 from lab.capture.store import Store
 from lab.capture_kinds.dark import DarkCapture, DarkSequence
-from lab.capture_kinds.slanted_edge import EdgeLayout, EdgeSequence, SlantedEdgeCapture, turned_layout
+from lab.capture_kinds.slanted_edge import EdgeLayout, EdgeSequence, SlantedEdgeCapture, turn_layout
 from lab.errors import InputError
 from tests.lab import fake_bench
 from tests.lab.fake_bench import COLS, ROWS
@@ -62,20 +62,20 @@ def test_an_edge_that_is_turned_is_where_a_turn_of_the_frame_has_it() -> None:
         region = EdgeLayout(
             name="one", region=(row - 1, col - 1, row + 2, col + 2), angle_deg=5.0, field_mm=(row - 50.0, col - 50.0)
         )
-        turned = turned_layout(region, 90.0, 101, 101)
+        turned = turn_layout(region, 90.0, 101, 101)
         assert turned is not None
         (there,) = np.argwhere(np.rot90(frame, 3))
         assert tuple(there) == (turned.region[0] + 1, turned.region[1] + 1)
         assert turned.field_mm == pytest.approx((there[0] - 50.0, there[1] - 50.0))
         assert turned.angle_deg == 95.0
-        back = turned_layout(turned, -90.0, 101, 101)
+        back = turn_layout(turned, -90.0, 101, 101)
         assert back == region
 
 
 def test_an_edge_that_leaves_the_frame_is_left_out() -> None:
     region = EdgeLayout(name="corner", region=(80, 160, 100, 180), angle_deg=5.0, field_mm=(0.4, 0.7))
-    assert turned_layout(region, 90.0, 100, 200) is None
-    assert turned_layout(region, 180.0, 100, 200) is not None
+    assert turn_layout(region, 90.0, 100, 200) is None
+    assert turn_layout(region, 180.0, 100, 200) is not None
 
 
 def test_the_operator_turns_the_edges_and_turns_them_back(store: Store) -> None:

@@ -305,9 +305,9 @@ def test_a_mismatch_without_a_name_gets_a_law_along_its_coordinate(
 
 @pytest.mark.extra
 def test_a_mismatch_that_nothing_predicts_says_what_would_help() -> None:
-    """Code densities don't follow so strong a pattern, either (open): they aren't what is asked here."""
     camera = ConcealedCamera(772302, (TreeRingsLaw(3.0),), cfa="MONO", rows=128, cols=192)
     found = diagnose(recordings_of(camera, LIT_AND_DARK), None)
+    assert "code_density" not in {item.measurement for item in found.unexplained}
     (alone,) = [item for item in found.unexplained if item.measurement == "flat_pattern"]
     assert alone.shape.startswith("irregular")
     assert alone.would_help.startswith("Nothing that was tried predicts it")
@@ -348,16 +348,19 @@ def test_a_law_is_found_alike_at_every_call_and_not_once_it_is_in_the_model() ->
 
 @pytest.mark.extra
 @pytest.mark.skipif(not DATA.is_dir(), reason="../shared isn't beside the project")
-def test_the_codes_of_a_real_ccd_repeat_every_four(tmp_path: Path) -> None:
-    """An independent look: four numbers take most off chi2 of codes left out, a table by code more (to 2.7)."""
+def test_the_codes_of_a_real_ccd_repeat_with_the_bits(tmp_path: Path) -> None:
+    """Independent histograms of all levels, each over a normal curve with a polynomial: tables of 4, 8, 64, 128 and 256
+    codes take 78, 81, 85, 89 and 90 % off chi2 of single codes; beyond 128 held-out codes gain nothing. Of what 128
+    takes, 4 codes take 88 % and 8 codes 91 %. What is left at held-out codes are dips of 5 % over eight codes (3256,
+    1256), the same in both frames and all halves of them, at codes that no other level has."""
     recordings = read(write(read_foreign("emva1288", DATA / "emva1288_ccd", ImportOptions()), tmp_path / "set"))
     fit = fit_recording_set(recordings, None, FOR_DIAGNOSIS)
     found = discover(dataset_of(recordings, "left", fit), (), DecisionPolicy())
     codes = next(one for one in found if one.look.stage == "codes")
-    assert codes.shorter[0].period == 4
+    assert (codes.period, codes.shorter[0].period) == (128, 8)
     before, after, n = codes.chi2
     assert before / n > 20.0
-    assert after / n < 3.0
+    assert after / n < 2.5
 
 
 @pytest.mark.parametrize(

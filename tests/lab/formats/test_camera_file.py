@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lab import cli
 from lab.errors import InputError
-from lab.formats.camera_file import CameraFile, default_camera, lens_cache, read_camera, said_of, write_camera
+from lab.formats.camera_file import CameraFile, default_camera, describe_quantity, lens_cache, read_camera, write_camera
 from sim.camera import CameraModel, Geometry, Lens
 from sim.effects.library import effect
 from sim.optics.imaging import MeasuredOtf, MeasuredPsf, TracedLens, ZernikePupil
@@ -116,7 +116,7 @@ def test_every_parameter_has_its_unit_and_meaning_beside_it(tmp_path: Path) -> N
     for model in (CameraModel, Lens):
         for key, quantity in read_quantities(model).items():
             assert any(
-                line.startswith((f"{key} = ", f"# {key} ")) and line.endswith(f"# {said_of(quantity)}")
+                line.startswith((f"{key} = ", f"# {key} ")) and line.endswith(f"# {describe_quantity(quantity)}")
                 for line in text.splitlines()
             )
 
@@ -155,7 +155,7 @@ def test_a_lens_is_traced_from_its_prescription(tmp_path: Path, monkeypatch: pyt
     """The tracer is called with the path as seen from the camera file; the path, not the table, is what is written
     back."""
     monkeypatch.setattr(
-        "lab.formats.camera_file.traced_table",
+        "lab.formats.camera_file.trace_table",
         lambda path, cache, progress: _table() if path.name == "a.zmx" else 1 / 0,
     )
     (tmp_path / "lenses").mkdir()

@@ -22,7 +22,7 @@ from lab.formats.camera_file import CameraFile, default_camera, write_camera
 from lab.formats.geometry_files import (
     TOLD_PX,
     Pair,
-    paired,
+    pair_cameras,
     write_colmap,
     write_kalibr,
     write_mrcal,
@@ -103,7 +103,7 @@ def pair(left: Geometry, right: Geometry) -> tuple[CameraFile, Pair]:
             )
         },
     )
-    return paired(camera(GEOMETRIES["ideal"]), camera(GEOMETRIES["ideal"], "front right"), stereo)
+    return pair_cameras(camera(GEOMETRIES["ideal"]), camera(GEOMETRIES["ideal"], "front right"), stereo)
 
 
 def rectified(of: Pair) -> Pair:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lab.formats.results.words import measured, plain_number, shown_unit
+from lab.formats.results.words import format_unit, format_value, plain_number
 
 
 @pytest.mark.parametrize(
@@ -27,11 +27,11 @@ from lab.formats.results.words import measured, plain_number, shown_unit
     ],
 )
 def test_values_are_rounded_to_their_uncertainty(value: float, std: float | None, text: str) -> None:
-    assert measured(value, std, "DN") == text
+    assert format_value(value, std, "DN") == text
 
 
 def test_an_interval_stands_in_place_of_a_standard_deviation() -> None:
-    assert measured(2.0, None, "um", (1.512, 14000.0)) == "2 (1.51 to 14,000) µm"
+    assert format_value(2.0, None, "um", (1.512, 14000.0)) == "2 (1.51 to 14,000) µm"
 
 
 @pytest.mark.parametrize(
@@ -43,4 +43,4 @@ def test_numbers_have_no_power_of_ten_where_a_reader_takes_the_digits(value: flo
 
 
 def test_units_are_printed_as_a_reader_knows_them() -> None:
-    assert [shown_unit(unit) for unit in ("um", "1", "percent", "DN/e")] == ["µm", "", "%", "DN/e"]
+    assert [format_unit(unit) for unit in ("um", "1", "percent", "DN/e")] == ["µm", "", "%", "DN/e"]

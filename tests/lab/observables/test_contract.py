@@ -43,7 +43,6 @@ WIDE = {
     "defective_pixels": "of counts of which none is expected",
     "flickering_pixels": "of counts of which none is expected",
     "dark_events": "of counts of which none is expected",
-    "code_density": "what is expected follows a part of the counts' noise",
     "bernoulli": "the floor of the drawing",
     "lateral_colour": "the floor of cells that stand square",
 }

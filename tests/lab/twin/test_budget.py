@@ -108,7 +108,7 @@ def test_a_capture_leaves_what_information_adds_up_to() -> None:
     one = LabCapture("", 1.0, False, 1, lambda _: np.zeros(6), np.diag(noise))
     # information adds: V'^-1 = V^-1 + J' S^-1 J
     wanted = np.linalg.inv(np.linalg.inv(known) + jacobian.T @ np.diag(1.0 / noise) @ jacobian)
-    assert one.known_after(known, jacobian) == pytest.approx(wanted, rel=1e-9, abs=1e-12)
+    assert one.update_covariance(known, jacobian) == pytest.approx(wanted, rel=1e-9, abs=1e-12)
 
 
 def test_dark_frames_tell_the_read_noise_beside_the_photon_transfer() -> None:
@@ -128,7 +128,7 @@ def test_what_goes_along_with_a_parameter_is_its_own() -> None:
     r = 0.5
     one = LinearUse(("a", "b"), np.array([[1.0], [2.0]]), np.array([[1.0, r], [r, 1.0]]))
     assert one.groups() == {"a": [0], "b": [1]}
-    assert one.told_by([0])[0, 0] == pytest.approx(1.0 + 2.0 * r)
+    assert one.propagate_errors([0])[0, 0] == pytest.approx(1.0 + 2.0 * r)
     assert one.std == pytest.approx(np.sqrt(1.0 + 4.0 + 4.0 * r))
 
 

@@ -26,9 +26,9 @@ from lab.formats.model_posterior import NameInDoubt, RivalModel, StoredEffect
 from lab.formats.recording_set import Manifest, RecordingSet, write
 from lab.formats.recording_set.files import MemoryFiles
 from lab.twin import score as twin_score
-from lab.twin.changes import Changes, carried, parse_changes
+from lab.twin.changes import Changes, apply_changes, parse_changes
 from lab.twin.predict import correction_covariance, predict
-from lab.twin.score import TwinVerdict, conclusion, score, together
+from lab.twin.score import TwinVerdict, combine_sessions, conclusion, score
 from lab.twin.sealed import PredictedNumber, open_seal, seal
 from lab.twin.session import future_session
 from sim.camera import CameraModel, Lens
@@ -135,7 +135,7 @@ def content() -> CameraFile:
 
 def captured(changes: Changes, seed: int) -> RecordingSet:
     """The session that is captured in the changed configuration, by the true camera."""
-    return future_session(carried(TRUTH, changes), PLAN, "left", changes, seed)
+    return future_session(apply_changes(TRUTH, changes), PLAN, "left", changes, seed)
 
 
 @pytest.mark.parametrize("name", TRANSFERS)
@@ -296,7 +296,7 @@ def test_a_transfer_tells_which_of_two_rivals_blurs() -> None:
     content = replace(content, posterior=content.posterior.model_copy(update={"doubts": doubts}))
 
     changes = Changes(f_number=8.0, radiance_factor=4.0)
-    taken = future_session(carried(blurred, changes), PLAN, "left", changes, 12)
+    taken = future_session(apply_changes(blurred, changes), PLAN, "left", changes, 12)
     tests = score(predict({"left": content}, PLAN, changes, light_std=0.0), taken).effects
     family = next(one for one in tests if one.effect == "charge_diffusion")
     assert (family.name, family.verdict, family.becomes) == ("isotropic_contrast_loss", "named", "defocus")
@@ -308,7 +308,7 @@ def test_a_transfer_tells_which_of_two_rivals_blurs() -> None:
     tests = score(predict({"left": content}, PLAN, changes, light_std=0.0), taken).effects
     name = next(one for one in tests if one.effect == "charge_diffusion")
     assert (name.verdict, name.becomes) == ("withdrawn", "defocus")
-    assert together([tests, tests])[0].gain == pytest.approx(2.0 * tests[0].gain)
+    assert combine_sessions([tests, tests])[0].gain == pytest.approx(2.0 * tests[0].gain)
 
 
 def test_the_conclusion_says_what_became_of_every_name() -> None:
@@ -370,7 +370,7 @@ def test_aberrations_say_at_which_aperture_they_were_fitted() -> None:
     """W040 of f/4 is a sixteenth at f/8, in the effects of the model, and in a rival's."""
     spherical, changes = SphericalAberration(w040_um=0.3), Changes(f_number=8.0, radiance_factor=4.0)
     model = replace(trained(3), effects=(DarkCurrentTemperature(doublings_per_c=0.14), spherical))
-    there = carried(model, changes)
+    there = apply_changes(model, changes)
     assert there.effects[1] == SphericalAberration(w040_um=0.3, stated_f_number=4.0)
     posterior = model.posterior
     assert posterior is not None

@@ -13,7 +13,7 @@ from lab.fit.mtf import fit_mtf
 from lab.foreign_recordings import read_slanted_edge
 from lab.formats import recording_set as recording
 from lab.formats.importers import ImportOptions, read_colour_chart
-from lab.formats.importers.single_picture import located_chart
+from lab.formats.importers.single_picture import locate_chart
 from lab.formats.recording_set import DataSheet
 from sim.scene.colorchecker import PATCHES, reflectances
 from sim.sensor import mosaic
@@ -150,7 +150,7 @@ def light(tmp_path: Path) -> Path:
 def test_the_patches_of_a_mosaic_are_located(cfa: str) -> None:
     """To a tenth of a patch, 5 px: inner halves of patches are averaged."""
     camera = DataSheet(rows=340, cols=460, cfa=cfa, bit_depth=12, black_level_dn=64.0)
-    found = located_chart(_mosaic(cfa), camera)
+    found = locate_chart(_mosaic(cfa), camera)
     assert found is not None
     np.testing.assert_allclose(np.array(found), CORNERS, atol=5.0)
 
@@ -225,7 +225,7 @@ def test_the_chart_of_a_real_camera_is_located() -> None:
     (file,) = (LLANOS / "frames").glob("*_550nm_2000ms_*.tif")  # which the detector takes mirrored
     labels = cv2.imread(str(LLANOS / "labels_550nm.png"), cv2.IMREAD_UNCHANGED)
     frame = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.uint16)
-    found = located_chart(frame, DataSheet(rows=frame.shape[0], cols=frame.shape[1], cfa="GBRG", bit_depth=8))
+    found = locate_chart(frame, DataSheet(rows=frame.shape[0], cols=frame.shape[1], cfa="GBRG", bit_depth=8))
     assert found is not None
     corner = np.array(found)
     k = np.arange(24)

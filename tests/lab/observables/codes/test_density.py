@@ -7,11 +7,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.special import ndtr
 
 from evaluation.draw import recordings_of
 from evaluation.independent_simulator import ConcealedCamera, Law, Plan
-from evaluation.independent_simulator.laws import AdcNonlinearityLaw, DigitalGainLaw, LossyCodesLaw
+from evaluation.independent_simulator.laws import AdcNonlinearityLaw, DigitalGainLaw, LossyCodesLaw, TreeRingsLaw
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
@@ -19,7 +18,7 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.observables.charts.chart import measure_chart
 from lab.observables.codes.density import measure_code_density
-from lab.observables.codes.even_light import NO_PATTERN, EvenLight, SensitivityPattern
+from lab.observables.codes.even_light import EvenLight, PatternSum
 from lab.observables.codes.landings import widths
 from lab.observables.darks.level import measure_dark
 from lab.observables.dataset import Dataset
@@ -28,6 +27,7 @@ from lab.observables.flats.noise import measure_noise
 from sim.effects.adc_ripple import AdcRipple
 from sim.effects.bit_weights import BitWeights
 from sim.effects.library import effect
+from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 from tests.lab.diagnose.on_blocks import dataset, rendered
 
@@ -50,23 +50,48 @@ def test_even_converters_show_nothing(seed: int) -> None:
     assert not mismatches(model, model.gaussian(), DecisionPolicy())
 
 
-def test_a_wave_with_normal_noise_is_spread_as_both() -> None:
-    """A wave of half of the variance has -1.5 / 4 of excess kurtosis with normal noise; bins of a fifth of its standard
-    deviation are off by 0.2^2 / 12 of it, which their own mean square makes up, and the noise takes the rest. Without a
-    pattern the distribution is normal, and so is what its mean square moves: half of its second derivative, twice."""
-    wave = SensitivityPattern(0.01 * np.sqrt(2.0) * np.sin(2.0 * np.pi * np.arange(5000) / 5000))
-    assert wave.variance == pytest.approx(1e-4, rel=0.2**2 / 6.0)
-    z = np.linspace(-6.5, 6.5, 2001)
-    share = np.diff(wave.shape(0.5)(z)[:, 0])
-    at = 0.5 * (z[1:] + z[:-1])
-    moments = [float(share @ at**k) for k in (0, 1, 2, 4)]
-    assert moments == pytest.approx([1.0, 0.0, 1.0, 3.0 - 1.5 / 4.0], abs=5e-3)
-    light = EvenLight(np.ones(1), np.array([1000.0]), np.zeros(1), 1000.0, 200.0, 60.0, 0.1, black_dn=0.0)
-    assert wave.rest_variance(light) == pytest.approx(100.0, rel=5e-3)
-    normal = NO_PATTERN.shape(0.0)(z).T
-    np.testing.assert_allclose(normal[0], ndtr(z), atol=1e-5)
-    np.testing.assert_allclose(normal[4], normal[2] / np.sqrt(2.0), atol=1e-5)
-    np.testing.assert_allclose(normal[5:], 0.0, atol=1e-5)
+def _drawn_light(frames: int, pattern: FloatArray, rng: np.random.Generator) -> tuple[EvenLight, FloatArray]:
+    """Light of `frames` drawn frames of one setting without black level, and the counts of their codes: 1000 DN times
+    `pattern` (rows, cols), with normal noise of 12 DN."""
+    drawn = np.rint(1000.0 * pattern + rng.normal(0.0, 12.0, (frames, *pattern.shape))).astype(np.float32)
+    found, light = PatternSum(), EvenLight(0.0)
+    for plane in drawn:
+        found.add(plane, 0.0)
+    for plane in drawn:
+        light.add(plane, found.sensitivity())
+    return light, np.bincount(drawn.astype(int).ravel(), minlength=2000).astype(float)
+
+
+@pytest.mark.parametrize("frames", [4, 16])
+def test_expected_counts_are_spread_as_the_frames_are(frames: int) -> None:
+    """Rings of 3 % and a period of 14 pixels, with a defect of -40 % in a thousand pixels: expected and counted codes
+    have equal mean and variance, and the same share about every tenth of the range. n frames have 1 / n of their noise
+    in the sensitivities. Of N pixels the mean is known to s / sqrt(N), but both are of the same pixels: so are the
+    shares, whose difference is smaller than 3 sqrt(q / N) of share q."""
+    rng = np.random.default_rng(3)
+    row, col = np.mgrid[:96, :128]
+    pattern = 1.0 + 0.03 * np.cos(2.0 * np.pi * np.hypot(row + 20.0, col + 30.0) / 14.0)
+    pattern[rng.integers(0, 96, 12), rng.integers(0, 128, 12)] *= 0.6
+    light, counted = _drawn_light(frames, pattern, rng)
+    expected = light.counts(gain=1e-6, codes=2000).expected()
+    number, code = counted.sum(), np.arange(2000)
+    assert expected.sum() == pytest.approx(number, rel=1e-6)
+    for weight in (code, np.square(code - 1000.0)):
+        scatter = np.sqrt(counted @ np.square(weight - counted @ weight / number) * number) / number
+        assert expected @ weight / number == pytest.approx(counted @ weight / number, abs=0.1 * scatter)
+    shares, others = (counts[940:1060].reshape(12, 10).sum(axis=1) for counts in (counted, expected))
+    assert np.all(np.abs(shares - others) < 3.0 * np.sqrt(others))
+
+
+@pytest.mark.parametrize("cfa", ["MONO", "RGGB"])
+def test_strong_tree_rings_are_no_structure_of_the_codes(cfa: str) -> None:
+    """Rings of 3 %, some 15 pixels wide, of levels that shade: half of them is finer than local means, half is not, and
+    both rise and fall together. chi2 of n numbers over n: 1 within 3 sqrt(2 / n) above, and nothing stands out."""
+    camera = ConcealedCamera(772302, (TreeRingsLaw(3.0),), cfa=cfa, rows=128, cols=192)
+    recordings = recordings_of(camera, Plan(("dark", "flat", "narrowband")))
+    block = measure_code_density(Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True)))
+    chi2 = float(block.value @ np.linalg.solve(block.covariance, block.value)) / len(block.value)
+    assert chi2 < 1.0 + 3.0 * np.sqrt(2.0 / len(block.value))
 
 
 def test_a_fixed_pattern_is_no_step_of_the_converter() -> None:
