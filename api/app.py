@@ -33,6 +33,7 @@ from api.routes import (
     calibrations,
     camera_models,
     findings,
+    foreign_files,
     jobs,
     knowledge,
     queue,
@@ -299,7 +300,19 @@ def create_app(
     app.include_router(open_to_all)
     strict = [Depends(check_query)]
     app.include_router(stations_router, prefix=PREFIX, dependencies=strict)
-    parts = (knowledge, sessions, queue, recordings, jobs, findings, calibrations, camera_models, twin, removed)
+    parts = (
+        knowledge,
+        sessions,
+        queue,
+        recordings,
+        foreign_files,
+        jobs,
+        findings,
+        calibrations,
+        camera_models,
+        twin,
+        removed,
+    )
     for part in parts:
         app.include_router(part.router, prefix=PREFIX, dependencies=strict)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]

@@ -17,6 +17,7 @@ import os
 import secrets
 import tempfile
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -39,6 +40,7 @@ from api.schemas import (
     DraftedLimits,
     FigureName,
     FigureOfFit,
+    ForeignSpectra,
     Halt,
     Halted,
     Health,
@@ -67,6 +69,7 @@ from api.schemas import (
     StoredCapture,
     StoredPrediction,
     StoredSession,
+    TableFitted,
 )
 from lab.calibration.life import BOARD_COLUMNS, CalibrationRecord, DriftBoard, History
 from lab.calibration.limits import CalibrationLimits
@@ -76,6 +79,7 @@ from lab.capture.session import Progress
 from lab.diagnose.visibility import EffectDescription, ParameterDescription
 from lab.engine import DEFAULT_ENGINE, Engine
 from lab.errors import InputError, one_line
+from lab.foreign_files import TableKind
 from lab.formats.recording_set import RecordingSet, archive, read
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.progress_bar import progress_bar
@@ -121,6 +125,17 @@ class _Connection(httpx.Client):
     def send(self, request: httpx.Request, **options: Any) -> httpx.Response:
         with _raise_unreachable(str(self.base_url.copy_with(path="/"))):
             return super().send(request, **options)
+
+
+@contextlib.contextmanager
+def _packed(*files: Path) -> Iterator[Path]:
+    """Yield an archive of a few files, side by side."""
+    with tempfile.TemporaryDirectory(prefix="calibench-") as folder:
+        archived = Path(folder) / "files.zip"
+        with zipfile.ZipFile(archived, "w", zipfile.ZIP_DEFLATED) as to:
+            for file in files:
+                to.write(file, file.name)
+        yield archived
 
 
 @contextlib.contextmanager
@@ -271,7 +286,7 @@ class ServiceClient:
         content = {} if body is None else {"json": body.model_dump(mode="json")}
         return _read(model, self.request("POST", path, **content).content)
 
-    def _send(self, model: type[M], path: str, archive: Path, **params: Any) -> M:
+    def _send(self, model: type[M], path: str, archive: Path, /, **params: Any) -> M:
         """Send a .zip, .tar or .tar.gz piece by piece: it may be larger than the memory."""
         sent = {".zip": "application/zip", ".tar": "application/x-tar"}.get(archive.suffix, "application/gzip")
         headers = {"Content-Type": sent, "Content-Length": str(archive.stat().st_size)}
@@ -558,6 +573,18 @@ class ServiceClient:
                 file.writelines(archive(opened, "tar"))
             return self._send(Recordings, "/recordings", packed, **stated)
 
+    def read_spectra(self, file: Path) -> ForeignSpectra:
+        """Return the spectra of a CGATS file (.sp, .ti3), by name."""
+        with _packed(file) as packed_file:
+            return self._send(ForeignSpectra, "/foreign/spectra", packed_file, path=file.name)
+
+    def fit_table(self, kind: TableKind, table: Path, camera: Path) -> TableFitted:
+        """Fit a table (CSV) of levels, of the camera that a camera.toml describes."""
+        with _packed(table, camera) as packed_files:
+            return self._send(
+                TableFitted, "/foreign/table", packed_files, format=kind, path=table.name, camera=camera.name
+            )
+
     def recordings(self) -> Iterator[Recordings]:
         """Yield all recording sets that were sent in, the newest first."""
         return self._pages(Recordings, "/recordings")
@@ -737,9 +764,11 @@ class ServiceClient:
         """Return a camera model, with the parameters of each camera."""
         return self._get(CameraModels, f"/camera-models/{model_id}")
 
-    def send_camera_model(self, archive: Path) -> CameraModels:
-        """Send in camera files, left.toml or right.toml or both, as a .zip, .tar or .tar.gz."""
-        return self._send(CameraModels, "/camera-models", archive)
+    def send_camera_model(self, archive: Path, *, lensfun: str = "", lens: str = "") -> CameraModels:
+        """Send in camera files, left.toml or right.toml or both, as a .zip, .tar or .tar.gz; with `lensfun`, behind the
+        `lens` of that file in the archive."""
+        stated = {name: value for name, value in (("lensfun", lensfun), ("lens", lens)) if value}
+        return self._send(CameraModels, "/camera-models", archive, **stated)
 
     def delete_camera_model(self, model_id: str) -> None:
         """Delete a camera model that was sent in, for ever."""

@@ -35,13 +35,16 @@ from lab.capture.station import Station
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
 from lab.capture_kinds.lamp import LampLight
 from lab.engine import DEFAULT_ENGINE, Engine
-from lab.foreign_recordings import KINDS
+from lab.foreign_files import TableKind
+from lab.foreign_recordings import importers
+from lab.formats.cgats import Quantity
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
 from lab.formats.results.diagnosis import DiagnosisVerdict
 from lab.jobs import RemovedKind
 from lab.pipeline import Step
 from lab.plain_text import complaints_of
 from sim.camera import Side
+from sim.spectrum import Spectrum
 
 #: Databases that forget the time zone give back UTC.
 Utc = Annotated[datetime, AfterValidator(lambda at: at if at.tzinfo else at.replace(tzinfo=UTC))]
@@ -412,6 +415,7 @@ class CameraModels(Schema):
     created: Utc
     sides: tuple[Side, ...]
     cameras: dict[Side, ModelOfCamera] = Field(default={}, description="what each is; empty in a list")
+    warnings: tuple[str, ...] = Field(default=(), description="what was left out of a lens that was sent in with it")
 
 
 class Comparison(Schema):
@@ -688,9 +692,9 @@ class Job(Schema):
 class SentAs(Schema):
     """What an archive holds: a recording set, or with `format` recordings as `calibench import` takes them."""
 
-    format: Annotated[str, _one_of("format", KINDS), Field(json_schema_extra={"enum": list(KINDS)})] | None = Field(
-        default=None, description="null: the archive is a recording set"
-    )
+    format: (
+        Annotated[str, _one_of("format", importers()), Field(json_schema_extra={"enum": list(importers())})] | None
+    ) = Field(default=None, description="null: the archive is a recording set")
     path: str = Field(default="", max_length=400, description="the picture, or the folder, inside the archive")
     checkerboard: str = Field(
         default="", max_length=9, description="checkerboard, raw-folder: ROWSxCOLS of inner corners"
@@ -717,6 +721,43 @@ class SentAs(Schema):
     )
     light: str = Field(default="", max_length=400, description="colorchecker: CSV inside the archive")
     white_patch: str = Field(default="", max_length=400, description="colorchecker: CSV inside the archive")
+
+
+class SentCamera(Schema):
+    """What is done with camera files that are sent in."""
+
+    lensfun: str = Field(default="", max_length=400, description="a lensfun file inside the archive")
+    lens: str = Field(default="", max_length=200, description="the model of the lens, where that file has several")
+
+
+class SentSpectra(Schema):
+    """Where the spectra are."""
+
+    path: str = Field(default="", max_length=400, description="the file inside the archive; empty: its only one")
+
+
+class ForeignSpectra(Schema):
+    """The spectra of another program's file, by name. `quantity` null: the file doesn't state it."""
+
+    quantity: Quantity | None
+    spectra: dict[str, Spectrum]
+    warnings: tuple[str, ...] = ()
+
+
+class SentTable(Schema):
+    """A table of levels: means and variances of channels (`photon-transfer-table`), or means by wavelength
+    (`spectral-table`)."""
+
+    format: TableKind
+    path: str = Field(default="", max_length=400, description="the CSV inside the archive; empty: its only one")
+    camera: str = Field(default="camera.toml", max_length=400, description="the data sheet inside the archive")
+
+
+class TableFitted(Schema):
+    """The fit of a table."""
+
+    fit: FitResult
+    warnings: tuple[str, ...] = ()
 
 
 class Recordings(Schema):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,3 +68,9 @@ async def receive_archive(service: Service, request: Request, most_bytes: int) -
             if error.errno not in FULL:
                 raise
             raise HTTPException(507, "the data folder is full; make room", headers=closing) from None
+
+
+def as_parameters(text: str) -> str:
+    """Return a sentence about the command line's options as one about a route's parameters."""
+    text = re.sub(r"--from (?=[a-z])", "format ", text)
+    return re.sub(r"--([a-z]+(?:-[a-z]+)*)", lambda match: match[1].replace("-", "_"), text)

@@ -22,6 +22,7 @@ from typing import Any, BinaryIO
 from api.unpacking import TooMuch, inside, unpack
 from lab.calibration.camera_models import SIDES
 from lab.errors import InputError
+from lab.foreign_files import put_lens_before
 from lab.formats import recording_set as recording
 from lab.formats.camera_file import CameraFile, read_camera
 from lab.formats.importers.single_picture import ImportOptions
@@ -32,7 +33,7 @@ _ID = re.compile(r"[0-9a-f]{16}")
 _MANIFEST = "manifest.json"
 #: A folder of an upload that a crash left behind is removed when it is older than this (s).
 _STALE_S = 86400.0
-#: Files of a camera model, at most: two cameras, their curves and arrays.
+#: Files of a camera model or of another program's file, at most: two cameras, their curves and arrays.
 _MODEL_FILES = 64
 
 
@@ -78,31 +79,61 @@ class Foreign:
 
     def read(self, folder: Path) -> RecordingSet:
         """Return the recordings below `folder`. Raises InputError."""
-        from lab.foreign_recordings import KINDS, read_foreign
+        from lab.foreign_recordings import importers, read_foreign
 
-        of_a_file = self.format in KINDS and KINDS[self.format].of_a_file
+        known = importers()
+        of_a_file = self.format in known and known[self.format].of_a_file
         if of_a_file and not self.path:
             raise InputError(f"path: a recording of the format {self.format} is one file; name it as in the archive")
         stated = self.statements
         there = replace(
             stated,
-            camera=stated.camera and self._locate(folder, "camera", str(stated.camera)),
-            light=stated.light and self._locate(folder, "light", str(stated.light)),
-            white_patch=stated.white_patch and self._locate(folder, "white_patch", str(stated.white_patch)),
+            camera=stated.camera and located(folder, "camera", str(stated.camera)),
+            light=stated.light and located(folder, "light", str(stated.light)),
+            white_patch=stated.white_patch and located(folder, "white_patch", str(stated.white_patch)),
         )
-        at = self._locate(folder, "path", self.path, a_file=of_a_file) if self.path else folder
+        at = located(folder, "path", self.path, a_file=of_a_file) if self.path else folder
         return read_foreign(self.format, at, there)
 
-    @staticmethod
-    def _locate(folder: Path, name: str, path: str, a_file: bool = True) -> Path:
-        """Return a file or folder of the archive. Raises InputError where it isn't in it."""
-        named = inside(path)
-        place = folder / named
-        if not place.exists() and named.parts[0] == folder.name:  # the one folder in which all of the archive is
-            place = folder.parent / named
-        if not (place.is_file() or (place.is_dir() and not a_file)):
-            raise InputError(f"{name} {path[:80]!r}: isn't in the archive; name it as in the archive")
-        return place
+
+def located(folder: Path, name: str, path: str, a_file: bool = True) -> Path:
+    """Return a file or folder of an unpacked archive. Raises InputError where it isn't in it.
+
+    folder : the archive's, or the one folder in it
+    name, path : the parameter that names it, and the name
+    """
+    named = inside(path)
+    place = folder / named
+    if not place.exists() and named.parts[0] == folder.name:  # the one folder in which all of the archive is
+        place = folder.parent / named
+    if not (place.is_file() or (place.is_dir() and not a_file)):
+        raise InputError(f"{name} {path[:80]!r}: isn't in the archive; name it as in the archive")
+    return place
+
+
+@dataclass(frozen=True)
+class ForeignFile:
+    """An archive of one file of another program, and what stands beside it."""
+
+    folder: Path
+
+    @classmethod
+    def unpacked(cls, place: Path, archive: Path, limit_bytes: int) -> ForeignFile:
+        """Unpack it. Raises InputError, and TooMuch beyond the limits."""
+        unpack(archive, place / "sent", limit_bytes, _MODEL_FILES)
+        return cls(_top(place / "sent", None))
+
+    def file(self, path: str, suffixes: tuple[str, ...]) -> Path:
+        """Return the file of that name, or without one the only file that ends so. Raises InputError."""
+        if path:
+            return located(self.folder, "path", path)
+        fitting = [one for one in sorted(self.folder.iterdir()) if one.is_file() and one.suffix.lower() in suffixes]
+        if len(fitting) != 1:
+            raise InputError(
+                f"path: the archive has {len(fitting)} files that end in {', '.join(suffixes)}; name the one that is "
+                "meant as in the archive"
+            )
+        return fitting[0]
 
 
 @dataclass(frozen=True)
@@ -187,9 +218,14 @@ class Inbox:
         return RecordingSet(manifest, source=id, files=FolderFiles(folder))
 
 
-def take_cameras(place: Path, archive: Path, limit_bytes: int) -> dict[Side, CameraFile]:
-    """Return the camera files of an archive: SIDE.toml, with the curves and arrays that they name beside them. Raises
-    InputError."""
+def take_cameras(
+    place: Path, archive: Path, limit_bytes: int, lensfun: str = "", lens: str = ""
+) -> tuple[dict[Side, CameraFile], tuple[str, ...]]:
+    """Return the camera files of an archive, SIDE.toml with the curves and arrays that they name beside them, and what
+    is remarked. Raises InputError.
+
+    lensfun, lens : the archive's file of a lensfun lens that is put before the cameras, and which of its lenses
+    """
     sent = place / "sent"
     unpack(archive, sent, limit_bytes, _MODEL_FILES)
     folder = _top(sent, None)
@@ -202,7 +238,13 @@ def take_cameras(place: Path, archive: Path, limit_bytes: int) -> dict[Side, Cam
         for arrays in folder.glob("*.npz"):
             with zipfile.ZipFile(arrays) as packed:  # it may be compressed: what it states is what is read
                 check_size(sum(entry.file_size for entry in packed.infolist()), limit_bytes)
-        return {side: read_camera(file, sent=True) for side, file in named.items()}
+        cameras = {side: read_camera(file, sent=True) for side, file in named.items()}
+        if not lensfun:
+            return cameras, ()
+        xml = located(folder, "lensfun", lensfun)
+        behind = {side: put_lens_before(xml, content, named[side], lens) for side, content in cameras.items()}
+        remarks = tuple(dict.fromkeys(remark for made in behind.values() for remark in made.remarks))
+        return {side: made.content for side, made in behind.items()}, remarks
     except TooMuch:
         raise
     except InputError as error:

@@ -49,7 +49,8 @@ def open_recordings(
 ) -> RecordingSet:
     """Open recordings: a recording set, a folder of raw files, or a stored session.
 
-    path : the folder; or, where there is none of that name, the id of a session in the data folder
+    path : the folder, or a URL (`s3://bucket/set`); or, where there is none of that name, the id of a session in the
+        data folder
     kind : the format of a folder that is no recording set: `raw-folder` (frames with an `index.csv`), `fits`,
         `emva1288`, `slanted-edge`, `colorchecker`, `dot-grid`, `checkerboard`. None: `raw-folder` where there is an
         `index.csv`, else `fits` where there are FITS files

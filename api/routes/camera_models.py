@@ -12,9 +12,9 @@ from fastapi.responses import HTMLResponse
 from api.archives import ARCHIVE, Form, Packed, stream_archive
 from api.errors import Conflict, answers
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
-from api.schemas import CameraModels, Comparison
+from api.schemas import CameraModels, Comparison, SentCamera
 from api.security import REPORT_POLICY
-from api.sending import BODY, receive_archive
+from api.sending import BODY, as_parameters, receive_archive
 from api.service import CALIBRATE, READ, Here, HexId, Service, camera_model
 from api.upload import take_cameras
 from lab.calibration import camera_models, life
@@ -64,15 +64,27 @@ def list_camera_models(
     responses=answers(401, 403, 413, 422, 503),
     openapi_extra=BODY,
 )
-async def send_camera_model(service: Here, request: Request, response: Response) -> CameraModels:
+async def send_camera_model(
+    service: Here, request: Request, response: Response, asked: Annotated[SentCamera, Query()]
+) -> CameraModels:
     """Send in camera files, left.toml or right.toml or both, with the arrays that they name beside them, as a .zip,
     .tar or .tar.gz. Each is read completely before it is kept. A traced lens is sent as its table, for no lens is
-    traced here."""
-    async with receive_archive(service, request, service.limits.model_bytes) as came:
-        content = await asyncio.to_thread(take_cameras, came.place, came.archive, service.limits.model_bytes)
+    traced here. With `lensfun`, a lens of that file in the archive is put before the cameras, as `calibench import
+    --from lensfun` does; `warnings` says what was left out."""
+    if asked.lens and not asked.lensfun:
+        raise HTTPException(422, "lens: is one of a lensfun file; name that as lensfun, or leave lens out")
+    limit = service.limits.model_bytes
+    async with receive_archive(service, request, limit) as came:
+        try:
+            content, remarks = await asyncio.to_thread(
+                take_cameras, came.place, came.archive, limit, asked.lensfun, asked.lens
+            )
+        except InputError as error:
+            raise InputError(as_parameters(str(error))) from None
+        warnings = tuple(came.name_as_sent(remark) for remark in remarks)
         id = await asyncio.to_thread(camera_models.bring_in, service.store, content)
     response.headers["Location"] = f"/api/v1/camera-models/{id}"
-    return await asyncio.to_thread(_whole, service, id)
+    return (await asyncio.to_thread(_whole, service, id)).model_copy(update={"warnings": warnings})
 
 
 @router.get("/camera-models/{model_id}", dependencies=[READ], responses=answers(401, 404, 422))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import re
 from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,7 +16,7 @@ from api.kept_sets import find_sent_set
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, WordsOfName, page_headers, page_of
 from api.preview import Form as PictureForm
 from api.schemas import CaptureCount, CaptureKind, RecordedCapture, Recordings, RecordingsDetail, SentAs
-from api.sending import BODY, receive_archive
+from api.sending import BODY, as_parameters, receive_archive
 from api.service import CALIBRATE, READ, Here, HexId, RegistryId, Service
 from api.unpacking import TooMuch
 from api.upload import Foreign
@@ -40,12 +39,6 @@ def _recordings(id: str, manifest: dict[str, Any], warnings: tuple[str, ...] = (
         captures=len(manifest["captures"]),
         warnings=warnings,
     )
-
-
-def _as_parameters(text: str) -> str:
-    """A sentence about the command line's options as one about this route's parameters."""
-    text = re.sub(r"--from (?=[a-z])", "format ", text)
-    return re.sub(r"--([a-z]+(?:-[a-z]+)*)", lambda match: match[1].replace("-", "_"), text)
 
 
 def _foreign(asked: SentAs) -> Foreign | None:
@@ -99,7 +92,7 @@ async def send_recordings(
         except TooMuch:
             raise
         except InputError as error:
-            raise InputError(_as_parameters(str(error)) if foreign is not None else str(error)) from None
+            raise InputError(as_parameters(str(error)) if foreign is not None else str(error)) from None
         lines = tuple(sent.name_as_sent(line) for line in warnings.warnings)
     response.headers["Location"] = f"/api/v1/recordings/{id}"
     return _recordings(id, warnings.manifest.model_dump(include={"name", "notes", "cameras", "captures"}), lines)

@@ -66,23 +66,15 @@ def import_spectra(path: Path, to: Path) -> None:
 
 def import_lens(path: Path, options: ImportOptions, lens: str, to: Path) -> None:
     """A lens of lensfun's before the camera of a camera file, as another camera file."""
+    from lab.foreign_files import put_lens_before
     from lab.formats.camera_file import read_camera, write_camera
-    from lab.formats.lensfun import read_lensfun, with_lens
 
     if [name for name in options.stated() if name != "--camera"] or options.camera is None:
         raise InputError(f"--from {LENSFUN} takes --camera FILE, the camera to put the lens before, and --lens alone")
-    content = read_camera(options.camera)
-    if content.camera.lens.focal_length_mm is None:
-        raise InputError(f"{options.camera}: lens.focal_length_mm is not set; write the lens's, as {path} has several")
-    model = read_lensfun(path, content.camera, lens)
-    try:
-        made, remarks = with_lens(content, model)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    warn(tuple(f"{path}: {remark}" for remark in remarks))
-    write_camera(to, made)
-    had = [name for name in ("distortion", "vignetting", "tca") if getattr(model, name) is not None]
-    out.print(escape(f"{to}: {model.model} at {model.focal_length_mm:g} mm: {', '.join(had)}"))
+    made = put_lens_before(path, read_camera(options.camera), options.camera, lens)
+    warn(made.remarks)
+    write_camera(to, made.content)
+    out.print(escape(f"{to}: {made.lens} at {made.focal_length_mm:g} mm: {', '.join(made.corrections)}"))
 
 
 def export_spectra(source: str, to: Path, quantity: str, data: Path | None) -> None:

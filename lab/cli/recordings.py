@@ -28,6 +28,7 @@ from lab.cli.exchange import (
 from lab.cli.sources import StoreFolder, recordings_of
 from lab.cli.tables import print_fit
 from lab.errors import InputError
+from lab.foreign_files import TABLES, TableKind
 from lab.pipeline import session_recordings
 
 if TYPE_CHECKING:
@@ -35,9 +36,6 @@ if TYPE_CHECKING:
 
 
 commands = typer.Typer()
-#: `--from` these: a CSV of channel means and variances by level, or of channel means by wavelength, which becomes a
-#: fit.
-LEVEL_TABLE, MEAN_TABLE = "photon-transfer-table", "spectral-table"
 
 
 @commands.command("import")
@@ -144,8 +142,8 @@ def import_(
     if kind == LENSFUN:
         import_lens(path, options, lens, out_folder)
         return
-    if kind in (LEVEL_TABLE, MEAN_TABLE):
-        _import_table(kind, path, options, out_folder)
+    if kind in TABLES:
+        _import_table(TABLES[kind], path, options, out_folder)
         return
     recordings = read_foreign(kind, path, options)
     warn(recordings.warnings)
@@ -156,27 +154,19 @@ def import_(
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 
-def _import_table(kind: str, path: Path, options: ImportOptions, file: Path) -> None:
+def _import_table(kind: TableKind, path: Path, options: ImportOptions, file: Path) -> None:
     """A table holds no frames: its import is a fit."""
-    from lab.fit.noise.noise_fit import fit_level_table
-    from lab.fit.spectral.mean_table import fit_mean_table
-    from lab.formats.cgats import read_foreign_csv
-    from lab.formats.importers.images import read_camera_file
+    from lab.foreign_files import fit_table
     from lab.formats.recording_set import Manifest, RecordingSet
 
     if [name for name in options.stated() if name != "--camera"]:
         raise InputError(f"--from {kind} takes --camera alone")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the table (CSV)")
     described = options.camera if options.camera is not None else path.parent / "camera.toml"
-    camera = read_camera_file(described, {"left": {"rows": 1, "cols": 1}}).get("left")
-    if camera is None:
-        raise InputError(f"{described}: describes no left camera; write the keys without a table")
     check_writable(file)
-    warn(tuple(f"{path}: {remark}" for remark in read_foreign_csv(path).remarks))
-    result = (fit_level_table if kind == LEVEL_TABLE else fit_mean_table)(path, camera)
-    write_json(result, file)
-    print_fit(RecordingSet(Manifest(cameras={"left": camera}, captures=())), result)
+    made = fit_table(kind, path, described)
+    warn(made.remarks)
+    write_json(made.fit, file)
+    print_fit(RecordingSet(Manifest(cameras={"left": made.camera}, captures=())), made.fit)
 
 
 @commands.command()
@@ -209,7 +199,8 @@ def export(
         typer.Option(
             "--to",
             metavar="PATH",
-            help="the recording set (a folder) or the file to write; tiled: a catalogue's folder, or a server's URL",
+            help="the recording set (a folder, or a URL as s3://bucket/set) or the file to write; tiled: a catalogue's "
+            "folder, or a server's URL",
         ),
     ],
     kind: Annotated[
@@ -248,7 +239,7 @@ def export(
     """
     from lab.formats import recording_set
 
-    if kind != TILED:  # a catalogue may be a server's
+    if kind != TILED and not recording_set.is_url(to):  # a catalogue may be a server's
         check_output(Path(to))
     if kind == SPECTRA:
         export_spectra(source, Path(to), quantity, data)
@@ -264,7 +255,10 @@ def export(
     recordings = session_recordings(store_to_read(data), source)
     warn(recordings.warnings)
     with progress_bar("export") as advance:
-        folder = recording_set.write(recordings, Path(to), progress=advance)
+        if recording_set.is_url(to):
+            folder, _ = recording_set.write_url(recordings, to, progress=advance)
+        else:
+            folder = str(recording_set.write(recordings, Path(to), progress=advance))
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 
@@ -32,3 +35,14 @@ def test_an_installed_driver_is_found_and_a_broken_one_named(monkeypatch: pytest
     assert registry.driver("stage", "carousel").__name__ == "PromptStage"
     with pytest.raises(InstrumentError, match="can't be loaded: No module named 'no_such_package'"):
         registry.driver("stage", "lost")
+
+
+def test_every_family_has_an_extra_with_those_of_its_drivers() -> None:
+    """`pip install calibench[FAMILY]` brings what a driver's message may ask for."""
+    root = Path(__file__).parents[2]
+    extras = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    for family in {family for family, _ in registry.drivers()}:
+        text = "\n".join(file.read_text(encoding="utf-8") for file in (root / "drivers" / family).glob("*.py"))
+        asked = set(re.findall(r"calibench with its extra (\w+)", text))
+        brought = {name for line in extras[family] for name in re.findall(r"[\w]+", line.partition("[")[2])}
+        assert asked <= brought, family

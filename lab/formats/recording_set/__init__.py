@@ -5,7 +5,7 @@ at all. The kinds of capture are in `lab.capture_kinds`."""
 
 from lab.formats.recording_set.checks import clipped_share, inspect
 from lab.formats.recording_set.files import RAWS, FolderFiles, Frame, RecordingFiles, Target, load_frame
-from lab.formats.recording_set.folder import ArchiveForm, archive, packed, read, write
+from lab.formats.recording_set.folder import ArchiveForm, archive, packed, read, write, write_url
 from lab.formats.recording_set.frame_codes import CELLS, CodeCounts, FrameCodes
 from lab.formats.recording_set.manifest import (
     DataSheet,
@@ -18,6 +18,7 @@ from lab.formats.recording_set.manifest import (
     parse_manifest,
     text_problems,
 )
+from lab.formats.recording_set.object_store import is_url
 from lab.formats.recording_set.recordings import RecordingSet, Summaries, frame_problem
 
 __all__ = [
@@ -42,6 +43,7 @@ __all__ = [
     "differences",
     "frame_problem",
     "inspect",
+    "is_url",
     "load_frame",
     "manifest_json",
     "packed",
@@ -49,4 +51,5 @@ __all__ = [
     "read",
     "text_problems",
     "write",
+    "write_url",
 ]

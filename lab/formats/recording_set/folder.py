@@ -18,14 +18,17 @@ import tifffile
 from lab.capture_kinds.base import Capture, Names, names_in
 from lab.errors import InputError, one_line
 from lab.formats.recording_set.checks import inspect
-from lab.formats.recording_set.files import FolderFiles, Frame, locate
+from lab.formats.recording_set.files import FolderFiles, Frame, RecordingFiles, locate
 from lab.formats.recording_set.manifest import RecordingError, manifest_json, parse_manifest
+from lab.formats.recording_set.object_store import ObjectStore, UrlFiles, is_url, put_once
 from lab.formats.recording_set.recordings import RecordingSet
 from lab.formats.spectrum_csv import format_spectrum
 
+MANIFEST = "manifest.json"
+
 
 def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None = None) -> RecordingSet:
-    """Return the recording set in the folder `path`, completely checked.
+    """Return the recording set in the folder `path`, or below a URL (`s3://bucket/set`), completely checked.
 
     path : the folder, or its manifest.json
     progress : called with a line of text when the captures are looked through
@@ -40,6 +43,8 @@ def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None
     >>> recordings.sides
     ('left',)
     """
+    if is_url(path):
+        return _read_url(str(path), progress)
     root = Path(path)
     if root.name == "manifest.json" and root.is_file():
         root = root.parent
@@ -53,8 +58,22 @@ def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None
         text = locate(root, "manifest.json").read_text(encoding="utf-8-sig")
     except (InputError, OSError, UnicodeDecodeError) as error:
         raise RecordingError([f"{root / 'manifest.json'}: {one_line(error)}"]) from error
-    manifest, skipped = parse_manifest(text, str(root / "manifest.json"))
-    recordings = RecordingSet(manifest, source=str(root), files=FolderFiles(root))
+    return _checked(text, str(root), FolderFiles(root), progress)
+
+
+def _read_url(url: str, progress: Callable[[str], None] | None) -> RecordingSet:
+    files = UrlFiles(ObjectStore(url.removesuffix(f"/{MANIFEST}")))
+    try:
+        text = files.store.content(MANIFEST).decode("utf-8-sig")
+    except (InputError, UnicodeDecodeError) as error:
+        raise RecordingError([f"{files.where(MANIFEST)}: {one_line(error)}"]) from error
+    return _checked(text, files.store.url, files, progress)
+
+
+def _checked(text: str, source: str, files: RecordingFiles, progress: Callable[[str], None] | None) -> RecordingSet:
+    """Return the set of a manifest and its files. Raises RecordingError with all that can't be used."""
+    manifest, skipped = parse_manifest(text, f"{source}/{MANIFEST}")
+    recordings = RecordingSet(manifest, source=source, files=files)
     if progress:
         progress(f"looking through {len(manifest.captures)} captures")
     problems, warnings = inspect(recordings)
@@ -62,9 +81,6 @@ def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None
         raise RecordingError([*skipped, *problems])  # a skipped capture may be the cause of a problem
     recordings.warnings = (*skipped, *warnings)
     return recordings
-
-
-MANIFEST = "manifest.json"
 
 
 def _place(recordings: RecordingSet, root: Path, path: str) -> Path:
@@ -181,6 +197,41 @@ def write(
             f"{folder}: can't be written ({one_line(error)}); make room or choose another folder"
         ) from error
     return folder
+
+
+def write_url(
+    recordings: RecordingSet, url: str, *, progress: Callable[[str, float], None] | None = None
+) -> tuple[str, int]:
+    """Write a recording set below a URL, the manifest last; what a call that broke off has written stays, and is
+    compared in place of being written again. Returns the URL and the number of files written.
+
+    Raises InputError where there is a recording set already, and RecordingError where `read` would refuse the set.
+    """
+    store = ObjectStore(url)
+    count, written = 0, set[str]()
+    try:
+        if store.size(MANIFEST) is not None:
+            raise InputError("holds a recording set already; give another place, or take that one away")  # noqa: TRY301
+
+        def loaded(capture: Capture, frame: Frame, share: float) -> None:
+            nonlocal count
+            if capture.frame not in written:
+                written.add(capture.frame)
+                count += put_once(store, capture.frame, _frame_content(recordings, capture.frame, frame))
+            if progress is not None:
+                progress(capture.id, share)
+
+        problems, _ = inspect(recordings, loaded)
+        if problems:
+            raise RecordingError(problems)  # noqa: TRY301
+        for name, content in _rest(recordings):
+            count += put_once(store, name, content)
+        store.put(MANIFEST, manifest_json(recordings.manifest).encode())
+    except RecordingError:
+        raise
+    except InputError as error:
+        raise InputError(f"{store.url}: {error}") from None
+    return store.url, count + 1
 
 
 #: A .zip has its list of files at the end; a .tar can be unpacked while it arrives.

@@ -467,7 +467,7 @@ def test_another_format_becomes_a_recording_set(running: Running, foreign: Path,
     archive = tmp_path / "sent.zip"
     archive.write_bytes(packed(foreign, top))
     with ServiceClient(running.url, running.keys["calibrate"]) as client:
-        found = client.send_recordings(archive, SentAs(format="raw-folder"))
+        found = client.send_recordings(archive, SentAs(format="raw-folder", path=top.strip("/")))
         assert found.captures == 2 and found.cameras == ("left",)
         assert [one.id for one in client.recordings()] == [found.id]
         read = recording.read(running.store.root / "recordings" / found.id)

@@ -64,7 +64,6 @@ def test_round_trip_with_the_mock(program: Callable[..., str], high: bool, steps
     ("fault", "error"),
     [
         ("never@2", NoAnswer), ("half@2", NoAnswer), ("error=2@1", Refused), ("error=4@1", Disconnected),
-        ("unplug=0.1@2", Disconnected),
     ],
 )  # fmt: skip
 def test_a_fault_is_one_error_and_then_it_works_again(

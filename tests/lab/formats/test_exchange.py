@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
+import os
 import shutil
 import struct
 import subprocess
@@ -17,6 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import rawpy
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -29,10 +31,15 @@ from lab.formats.colour_profile import colour_matrices, energy_sensitivities, wr
 from lab.formats.lensfun import read_lensfun, with_lens, write_lensfun
 from lab.formats.pyxel_file import VOLT_PER_DN, write_pyxel
 from lab.formats.scene_file import exr_lights, light, read_cube, read_light, scene
+from lab.interface import simulate, write_frame
 from sim.camera import Geometry
 from sim.effects.lateral_chromatic_aberration import LateralChromaticAberration
 from sim.effects.vignetting import Vignetting
 from sim.optics.illumination import relative_illumination
+from sim.scene.catalogue import scene_by_name
+from sim.scene.light import illuminant
+from sim.scene.scenes import ReflectanceChart
+from sim.scene.warp import Warp
 from sim.spectrum import Spectrum
 from tests.peers import missing
 
@@ -333,6 +340,85 @@ def test_a_dcp_is_a_tiff_with_our_matrices(tmp_path: Path) -> None:
         for code, matrix in zip(codes, colour_matrices(CAMERA.camera, name), strict=True):
             numbers = np.array(tags[code], float).reshape(9, 2)
             np.testing.assert_allclose(numbers[:, 0] / numbers[:, 1], matrix.ravel(), atol=1e-6)
+
+
+#: RawTherapee as it develops without a will of its own: the camera's white balance, the DCP's matrix for D65, sRGB.
+NEUTRAL = """[Version]
+AppVersion=5.9
+Version=349
+[Exposure]
+Auto=false
+Compensation=0
+HistogramMatching=false
+Curve=0;
+Curve2=0;
+[HLRecovery]
+Enabled=false
+[White Balance]
+Enabled=true
+Setting=Camera
+[Color Management]
+InputProfile=file:{profile}
+ToneCurve=false
+ApplyLookTable=false
+ApplyBaselineExposureOffset=false
+ApplyHueSatMap=false
+DCPIlluminant=2
+WorkingProfile=ProPhoto
+OutputProfile=RTv4_sRGB
+OutputProfileIntent=Relative
+OutputBPC=false
+[Sharpening]
+Enabled=false
+"""
+#: XYZ of the PCS (D50) to linear sRGB, by Bradford's adaptation.
+D50_TO_SRGB = np.array(
+    [
+        [3.1338561, -1.6168667, -0.4906146],
+        [-0.9787684, 1.9161415, 0.0334540],
+        [0.0719453, -0.2289914, 1.4052427],
+    ]
+)
+
+
+def test_rawtherapee_develops_with_the_dcp(tmp_path: Path) -> None:
+    """A raw converter puts the ColorChecker's 24 patches where the DCP's matrix does."""
+    if shutil.which("rawtherapee-cli") is None:
+        missing("RawTherapee isn't installed (scripts/install-peers)")
+    tifffile = library("tifffile")
+    small = replace(CAMERA, camera=CAMERA.camera.model_copy(update={"rows": 320, "cols": 480}))
+    made = simulate("colorchecker24", small, exposure_s=0.02, illuminant="D65", expected=True, progress=False)
+    write_frame(made, tmp_path / "chart.dng")
+    write_dcp(tmp_path / "c.dcp", small)
+    (tmp_path / "neutral.pp3").write_text(NEUTRAL.format(profile=tmp_path / "c.dcp"))
+    subprocess.run(
+        ["rawtherapee-cli", "-o", tmp_path / "out.tif", "-b16", "-t", "-Y", "-p", tmp_path / "neutral.pp3",
+         "-c", tmp_path / "chart.dng"],
+        check=True, capture_output=True, timeout=120, env=os.environ | {"HOME": str(tmp_path)},
+    )  # fmt: skip
+    code = tifffile.imread(tmp_path / "out.tif") / 65535.0
+    linear = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+    border = (320 - code.shape[0]) // 2
+    with rawpy.imread(str(tmp_path / "chart.dng")) as raw:
+        signal, balance = raw.raw_image_visible - 64.0, np.array(raw.camera_whitebalance[:3])
+    chart = scene_by_name("colorchecker24", small.camera, illuminant("D65", 100.0))
+    assert isinstance(chart, ReflectanceChart)
+    to_camera = Warp.from_corners(6 - chart.gap, 4 - chart.gap, chart.corners).to_camera
+    developed, balanced = np.empty((24, 3)), np.empty((24, 3))
+    for k in range(24):
+        row, col = (2 * (int(at[0]) // 2) for at in to_camera([k % 6 + 0.435], [k // 6 + 0.435]))
+        patch = signal[row - 10 : row + 10, col - 10 : col + 10]
+        green = 0.5 * (patch[::2, 1::2].mean() + patch[1::2, ::2].mean())
+        balanced[k] = balance * (patch[::2, ::2].mean(), green, patch[1::2, 1::2].mean())
+        there = slice(row - 10 - border, row + 10 - border), slice(col - 10 - border, col + 10 - border)
+        developed[k] = linear[there].mean(axis=(0, 1))
+    _, forward = colour_matrices(small.camera, "D65")
+    predicted = balanced @ forward.T @ D50_TO_SRGB.T
+    predicted *= developed[18:22].sum() / predicted[18:22].sum()  # the converter's scale
+    within = np.all((predicted > 0) & (developed < 0.999), axis=1)  # sRGB holds no others
+    assert within.sum() >= 20
+    # RawTherapee's tables of its working space and of sRGB's curve: seen are 0.5 % of white at most.
+    np.testing.assert_allclose(developed[within], predicted[within], rtol=0, atol=0.01 * developed[18].mean())
 
 
 def test_argyll_reads_the_icc_profile(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 import ctypes
 import re
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -190,6 +191,29 @@ def test_camera_info_of_a_pair_rectifies_it(tmp_path: Path) -> None:
     direct = beside @ array(other["projection_matrix"])[:, :3].T
     np.testing.assert_allclose(right_px, direct[:, :2] / direct[:, 2:], rtol=0, atol=CLOSE_PX)
     np.testing.assert_allclose(left_px[:, 1], right_px[:, 1], rtol=0, atol=CLOSE_PX)
+
+
+#: ROS's own parser (camera_calibration_parsers), where the distribution puts its program.
+ROS_CONVERT = Path("/usr/lib/camera_calibration_parsers/convert")
+
+
+@pytest.mark.parametrize("name", ["ideal", "k3", "k6", "fisheye", "pair"])
+def test_ross_own_parser_reads_every_number(tmp_path: Path, name: str) -> None:
+    """It reads the file into a CameraInfo and writes that with all its digits."""
+    if not ROS_CONVERT.is_file():
+        pytest.skip("ROS's parser isn't installed (the distribution's camera-calibration-parsers-tools)")
+    if name == "pair":
+        left, both = pair(GEOMETRIES["k3"], GEOMETRIES["k6"])
+        write_ros(tmp_path / "c.yaml", left, rectified(both))
+    else:
+        write_ros(tmp_path / "c.yaml", camera(GEOMETRIES[name]))
+    files = sorted(tmp_path.glob("c*.yaml"))
+    assert len(files) == (2 if name == "pair" else 1)
+    for file in files:
+        back = tmp_path / f"back-{file.name}"
+        done = subprocess.run([ROS_CONVERT, file, back], capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0 and back.is_file(), done.stdout + done.stderr
+        assert yaml.safe_load(back.read_text()) == yaml.safe_load(file.read_text())
 
 
 def test_a_pair_without_rectification_is_told(tmp_path: Path) -> None:
