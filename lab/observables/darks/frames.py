@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy import ndimage
@@ -328,8 +329,7 @@ def cell_means(image: Image, cells: tuple[int, int] = CELLS) -> FloatArray:
     """Return the means of an image over `cells`, rows and columns of equal parts."""
     r = np.linspace(0, image.shape[0], cells[0] + 1).astype(int)
     c = np.linspace(0, image.shape[1], cells[1] + 1).astype(int)
-    total = np.add.reduceat(np.add.reduceat(image, r[:-1], 0, dtype=float), c[:-1], 1)
-    return np.asarray(total / np.outer(np.diff(r), np.diff(c)))
+    return np.array([[image[a:b, d:e].mean(dtype=float) for d, e in pairwise(c)] for a, b in pairwise(r)])
 
 
 #: Quantities of the stages by which an effect makes pixels defective.

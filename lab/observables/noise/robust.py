@@ -131,8 +131,9 @@ def _coarse_means(image: Image) -> Image:
     time of means about every pixel."""
     short = [-n % BLOCK_PX for n in image.shape]
     whole = np.pad(image, [(0, n) for n in short], mode="edge")
-    rows, cols = (n // BLOCK_PX for n in whole.shape)
-    blocks = whole.reshape(rows, BLOCK_PX, cols, BLOCK_PX).mean(axis=(1, 3))
+    in_rows = sum(whole[k::BLOCK_PX] for k in range(1, BLOCK_PX)) + whole[::BLOCK_PX]
+    blocks = sum(in_rows[:, k::BLOCK_PX] for k in range(1, BLOCK_PX)) + in_rows[:, ::BLOCK_PX]
+    blocks /= np.float32(BLOCK_PX**2)
     means = ndimage.uniform_filter(blocks, LOCAL_PX // BLOCK_PX, mode="mirror")
     return np.asarray(means.repeat(BLOCK_PX, 0).repeat(BLOCK_PX, 1)[: image.shape[0], : image.shape[1]])
 

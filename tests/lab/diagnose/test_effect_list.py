@@ -77,11 +77,11 @@ def test_rivals_are_symmetric_candidates() -> None:
 
 
 def test_what_shows_an_effect_is_what_its_physics_says() -> None:
-    """Blooming keeps within saturated frames, which no measurement reads. Blurs show on edges and screens, charge in
-    darks."""
+    """Blooming keeps within saturated frames, which no measurement reads. Blurs show on edges and screens, dark
+    current in dark frames and in the masked pixels of flats."""
     assert [name for name, one in visibility().items() if not one.measurements] == ["blooming"]
     assert set(visibility()["defocus"].capture_kinds) == {"slanted_edge", "bernoulli"}
-    assert visibility()["dark_current_temperature"].capture_kinds == ("dark",)
+    assert visibility()["dark_current_temperature"].capture_kinds == ("dark", "flat")
     assert visibility()["stereo_time_offset"].measurements == ("stereo_time",)
     assert "defocus" in visibility()["optical_low_pass_filter"].rivals
     assert "defocus" not in visibility()["row_noise"].rivals
