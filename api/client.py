@@ -123,7 +123,7 @@ class _Connection(httpx.Client):
     """Connections whose failures are one line with a remedy."""
 
     def send(self, request: httpx.Request, **options: Any) -> httpx.Response:
-        with _reached(str(self.base_url.copy_with(path="/"))):
+        with _raise_unreachable(str(self.base_url.copy_with(path="/"))):
             return super().send(request, **options)
 
 
@@ -139,7 +139,7 @@ def _packed(*files: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _reached(url: str) -> Iterator[None]:
+def _raise_unreachable(url: str) -> Iterator[None]:
     """Raise ServiceUnreachable where httpx doesn't reach the service, or loses it while an answer arrives."""
     try:
         yield
@@ -265,7 +265,7 @@ class ServiceClient:
         partial = file.with_name(f".{file.name}.partial")
         try:
             with (
-                _reached(self.url),
+                _raise_unreachable(self.url),
                 self.http.stream("GET", f"{path}{file.suffix or '.zip'}") as response,
                 partial.open("wb") as to,
             ):
@@ -297,7 +297,7 @@ class ServiceClient:
     def _events(self, path: str) -> Iterator[tuple[str, str]]:
         """(name, data) of each event of a stream, as it arrives."""
         name = ""
-        with _reached(self.url), self.http.stream("GET", path, timeout=EVENTS_S) as response:
+        with _raise_unreachable(self.url), self.http.stream("GET", path, timeout=EVENTS_S) as response:
             if response.is_error:
                 response.read()
                 raise _problem(response)

@@ -13,7 +13,7 @@ from api.schemas import ForeignSpectra, SentSpectra, SentTable, TableFitted
 from api.sending import BODY, Arrived, as_parameters, receive_archive
 from api.service import CALIBRATE, Here
 from api.unpacking import TooMuch
-from api.upload import ForeignFile, as_in_archive, located
+from api.upload import ForeignFile, located, name_as_in_archive
 from lab.errors import InputError, NotDetermined
 from lab.foreign_files import fit_table
 from lab.formats.cgats import read_cgats
@@ -65,4 +65,4 @@ def _told(came: Arrived, read: Callable[[Arrived], T]) -> T:
     except TooMuch:
         raise
     except (InputError, NotDetermined) as error:
-        raise InputError(as_parameters(as_in_archive(str(error), came.place))) from None
+        raise InputError(as_parameters(name_as_in_archive(str(error), came.place))) from None

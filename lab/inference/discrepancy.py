@@ -31,8 +31,10 @@ from sim.effects.screen_gamma import ScreenGamma
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
-#: Change of a node for the differences: small, so that they are derivatives; of factors 1 %.
-_STEP = 0.01
+#: Change of a node for the differences: small, so that they are derivatives; of factors 0.1 %. What acts by its square
+#: (shading on the power of rows) has a slope of 0 where it is absent; by steps of 1 % it had a hundredth of that at 1,
+#: which let flats' rows decide on the shading.
+_STEP = 0.001
 #: Correlation length of a process in nodes.
 _NODES_CORRELATED = 2.0
 #: Distance of the nodes of the transmittance, nm, and their correlation length in nodes: coatings ripple with periods
@@ -507,6 +509,21 @@ def _on_observables(model: MeasurementModel, names: Sequence[str], used: int) ->
         labels = tuple(label for b in blocks for label in b.labels)
         curve = ObservableCurve(blocks[0].measurement, labels, scale, int(np.sum(where < used)))
         yield _Columns(own, factor, curve, MOST_ON_OBSERVABLE)
+
+
+def law_error(block: Observable, kernel: FloatArray, change: FloatArray, is_invariant: bool) -> FloatArray:
+    """Return the covariance (n, n) of the error of a law that changes an observable's numbers by `change` (n,), at an
+    error of all of it. It is smooth along the axis (`observable_kernel`) and in the logarithm of the change, of a law
+    that doesn't depend on the axis in that of the change as a share of the scale."""
+    size = np.abs(change) / block.scale if is_invariant else np.abs(change)
+    size = np.log(np.maximum(size, 1e-9 * max(float(size.max()), 1e-300)))
+    alike = kernel * np.exp(-0.5 * np.square(size[:, None] - size))
+    return np.asarray(change[:, None] * alike * change)
+
+
+def depends_not_on_axis(block: Observable, law: type[Effect]) -> bool:
+    """Whether a law doesn't depend on the axis of an observable."""
+    return block.measurement.axis in law.invariances
 
 
 def observable_kernel(*blocks: Observable, is_invariant: bool = False) -> FloatArray:
