@@ -153,7 +153,11 @@ class Truth:
 
 
 def makers_efficiency() -> dict[str, Spectrum]:
-    """Return the maker's QE curves (electrons a photon, 380..780 nm by 5), without infrared filter."""
+    """Return the maker's QE curves (electrons a photon, 380..780 nm by 5), without infrared filter.
+
+    >>> list(makers_efficiency())
+    ['R', 'G', 'B']
+    """
     w = np.arange(380.0, 780.1, 5.0)
     return {channel: Spectrum.of(w, np.round(curve, 4)) for channel, curve in _efficiency(w).items()}
 

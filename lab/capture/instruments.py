@@ -257,7 +257,7 @@ class Instruments:
 def _snapshot(driver: Instrument) -> InstrumentSnapshot:
     """Return what a connected instrument says of itself. Raises InstrumentError."""
 
-    def told(values: Mapping[str, Setting]) -> dict[str, Setting]:
+    def with_finite_numbers(values: Mapping[str, Setting]) -> dict[str, Setting]:
         return {
             key: str(setting) if isinstance(setting, float) and not math.isfinite(setting) else setting
             for key, setting in values.items()
@@ -265,8 +265,8 @@ def _snapshot(driver: Instrument) -> InstrumentSnapshot:
 
     return InstrumentSnapshot(
         **vars(driver.identity()),
-        settings=told(driver.settings()),
-        found=told(driver.found()),
+        settings=with_finite_numbers(driver.settings()),
+        found=with_finite_numbers(driver.found()),
         departures=driver.departures(),
     )
 

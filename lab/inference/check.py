@@ -143,7 +143,7 @@ def _predict(
 ) -> tuple[FloatArray, FloatArray]:
     """Residual (n*,) and covariance (n*, n*) of the held-out numbers given those that are used, under one set, its
     parameters, theta and delta marginalised about the mode. `without`: a group of which there is none."""
-    fit = table.fits[row.members]
+    fit = table.fits[row.members].given(row.unlisted)
     model = problem.whole_model(problem.groups)
     used = len(problem.measured.value)
     value = problem.whole.value

@@ -60,7 +60,7 @@ def _sets_with(table: Table, group: int) -> Iterator[Row]:
 
 
 def _given_set(table: Table, model: Model, row: Row, group: int) -> Delta:
-    fit = table.fits[row.members]
+    fit = table.fits[row.members].given(row.unlisted)
     bare = model.gaussian(fit.state, fit.likeliest.form)
     tau = fit.likeliest.scales.mode(row.unlisted)
     gaussian = with_columns(

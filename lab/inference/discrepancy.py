@@ -31,8 +31,10 @@ from sim.effects.screen_gamma import ScreenGamma
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
-#: Change of a node for the differences: small, so that they are derivatives; of factors 1 %.
-_STEP = 0.01
+#: Change of a node for the differences: small, so that they are derivatives; of factors 0.1 %. What acts by its square
+#: (shading on the power of rows) has a slope of 0 where it is absent; by steps of 1 % it had a hundredth of that at 1,
+#: which let flats' rows decide on the shading.
+_STEP = 0.001
 #: Correlation length of a process in nodes.
 _NODES_CORRELATED = 2.0
 #: Distance of the nodes of the transmittance, nm, and their correlation length in nodes: coatings ripple with periods

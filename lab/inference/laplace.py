@@ -16,6 +16,7 @@ from functools import cache
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
+from scipy.optimize import lsq_linear
 from scipy.special import log_ndtr, logsumexp, ndtr, ndtri
 from scipy.stats import qmc
 
@@ -142,6 +143,22 @@ def _prior_ratio(c: Coordinate, u: float, d: FloatArray) -> FloatArray:
     """Log of the prior at u + d over that of the expansion about u."""
     slope, precision = c.slope_and_precision(u)
     return np.asarray(c.log_prior(u + d) - c.log_prior(u) - slope * d + 0.5 * precision * d * d)
+
+
+def best_within_bounds(
+    a: FloatArray, b: FloatArray, coords: Sequence[Coordinate], u: FloatArray
+) -> tuple[FloatArray, float]:
+    """Return the step d (p,) within the bounds of u + d at which b'd - d'a d / 2 and the prior, normal about u, gain
+    most, and that gain."""
+    slope, precision = np.array([c.slope_and_precision(float(x)) for c, x in zip(coords, u, strict=True)]).T
+    low, high = bounds(coords)
+    size = np.sqrt(np.maximum(np.diag(a) + precision, 1e-300))
+    inner = (a + np.diag(precision)) / np.outer(size, size) + 1e-10 * np.eye(len(u))
+    root = np.linalg.cholesky(inner)
+    target = np.linalg.solve(root, (b + slope) / size)
+    least, most = np.minimum((low - u) * size, -1e-12), np.maximum((high - u) * size, 1e-12)
+    x = lsq_linear(root.T, target, (least, most), method="bvls").x
+    return np.asarray(x / size), float(target @ target - np.sum(np.square(root.T @ x - target))) / 2.0
 
 
 def near_bound(found: Laplace, coords: Sequence[Coordinate], u: FloatArray, sigma: float) -> list[int]:

@@ -421,9 +421,10 @@ class ScaleIntegral:
         return float(np.where(is_unlisted, self.prior_log[1], self.prior_log[0]).sum())
 
     def weights(self, least: float = 5.0) -> dict[frozenset[int], float]:
-        """Log of p(y | A, u) p(u) of no, single and pair flips. Of flips that are more than `least` below the best, and
-        of all but the `REFINED` likeliest, it is that with the scales of the others as without; pairs are of the
-        likeliest groups that aren't, by themselves."""
+        """Log of p(y | A, u) p(u) of no, single and pair flips, and of larger ones about the best. Of flips that are
+        more than `least` below the best, and of all but the `REFINED` likeliest, it is that with the scales of the
+        others as without; pairs are of the likeliest groups that aren't, by themselves. The best is extended by what
+        promises most beside it: what a process leaves may be far beyond noise, and yet small beside that process."""
         none: frozenset[int] = frozenset()
         found = {none: self.everyday + self.log_prior(none)}
         roughly = {g: self.everyday + gain + self.log_prior(frozenset((g,))) for g, gain in self._flips[1].items()}
@@ -437,11 +438,32 @@ class ScaleIntegral:
             for b in near[:i]:
                 pair = a | b
                 found[pair] = self.flipped(pair) + self.log_prior(pair)
+        best = max(found, key=lambda u: found[u])
+        while 0 < len(best) < MOST_UNLISTED:
+            more = [u for u in self._extended(best) if u not in found]
+            found |= {u: self.flipped(u) + self.log_prior(u) for u in more}
+            larger = max((u for u in found if best < u), key=lambda u: found[u], default=best)
+            if found[larger] <= found[best]:
+                break
+            best = larger
         return found
 
+    def _extended(self, unlisted: frozenset[int], least: float = 3.0) -> list[frozenset[int]]:
+        """Return these groups with one more, of `PAIRED` that promise most beside them, that are at most `least` less
+        likely."""
+        tau, prior = self.mode(unlisted), self.log_prior(unlisted)
+        found = {}
+        for g, gains in self.profiles_of_processes(tau, self.projected[:, None]):
+            more = unlisted | {g}
+            if g not in unlisted:
+                found[more] = log_mean(gains[:, 0], self.groups[g].shares(True)) + self.log_prior(more) - prior
+        near = sorted((u for u in found if found[u] > -least), key=lambda u: -found[u])
+        return near[:PAIRED]
 
-#: Groups of which all pairs are tried, and those with which the scales of the others are at their mode again.
-PAIRED, REFINED = 4, 8
+
+#: Groups of which all pairs are tried, and that are tried beside the best; the most that are unlisted; and those with
+#: which the scales of the others are at their mode again.
+PAIRED, MOST_UNLISTED, REFINED = 4, 4, 8
 
 
 def log_mean(values: FloatArray, shares: FloatArray) -> float:

@@ -141,8 +141,14 @@ def parameter_draws(table: Table, name: str) -> FloatArray:
     """Draw an effect's parameters u (k, p) from the mixture of the refitted sets that hold it, each over its modes."""
     rng = np.random.default_rng(0)
     draws: list[FloatArray] = []
-    for members, weight in weights_of_sets(table, name).items():
-        best = table.fits[members]
+    rows = [row for row in table.rows if row.refitted and name in row.members]
+    total = sum(row.probability for row in rows)
+    weights: dict[tuple[frozenset[str], int], tuple[FittedSet, float]] = {}
+    for row in rows:
+        fit = table.fits[row.members].given(row.unlisted)
+        key = row.members, id(fit)
+        weights[key] = fit, row.probability / total + (weights[key][1] if key in weights else 0.0)
+    for best, weight in weights.values():
         modes = (best, *best.others)
         log = np.array([best.base - best.shift, *(m.base for m in best.others)])
         shares = np.exp(log - log.max())

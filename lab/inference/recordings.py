@@ -44,6 +44,9 @@ from sim.uniform import electron_rate
 
 #: Standard deviations of the noise by which a usual size has to change the numbers.
 LEAST_SHOWN = 0.3
+#: The largest share of its change that a law may be wrong by: the largest tolerance that any effect declares. What
+#: differs by more is another law.
+MOST_WRONG = 0.3
 
 
 @dataclass
@@ -117,7 +120,7 @@ class SideModel:
                 if own.any():
                     block = self.measured.blocks[index]
                     is_invariant = depends_not_on_axis(block, type(effect))
-                    error = form_scale * effect.form_tolerance * own
+                    error = min(form_scale * effect.form_tolerance, MOST_WRONG) * own
                     kernel = self._kernel(index, is_invariant)
                     gaussian = gaussian.with_discrepancy(index, law_error(block, kernel, error, is_invariant))
         return gaussian

@@ -39,7 +39,7 @@ from lab.inference.hypotheses import (
     stacked,
     symmetric,
 )
-from lab.inference.laplace import Laplace, bounds, correct_along, integrate, near_bound
+from lab.inference.laplace import Laplace, best_within_bounds, bounds, correct_along, integrate, near_bound
 from lab.inference.model import (
     FormScale,
     Model,
@@ -89,6 +89,11 @@ NEARLY_LINEAR = 0.3
 STEEP = 0.5
 #: Healthy draws whose p(nothing) is taken as that of a measured set: so many of the lowest, of so many at most.
 LOWEST, MOST_REFINED = 2, 40
+#: Gain of log posterior by unlisted groups from which on parameters are fitted anew with these: where they take most of
+#: what a hypothesis explained, its mode is elsewhere. The most such fits of a set.
+MOVED, MOST_MOVED = 3.0, 3
+#: Gain of log posterior by the linear problem about a mode, above which the prediction has to have a half of it.
+PROMISED = 1.0
 #: Gain of log evidence up to which a size may be near 0, where shapes vanish.
 WEAK = 6.0
 #: Probability that the laws of the likeliest set are inexact from which on others are looked for in the place of its
@@ -123,7 +128,8 @@ class FormFit:
 @dataclass(frozen=True)
 class FittedSet:
     """A refitted set at its mode, for each scale of form errors. `jacobian` (n, p) of m by u at the
-    mode; `others`: further modes of the posterior, which `shift` adds to the evidence of this one."""
+    mode; `others`: further modes of the posterior, which `shift` adds to the evidence of this one. `flipped`: fits
+    about the mode with these groups unlisted, where that is another."""
 
     state: State
     coordinates: tuple[Coordinate, ...]
@@ -134,6 +140,12 @@ class FittedSet:
     pull: FloatArray
     others: tuple[FittedSet, ...] = ()
     shift: float = 0.0
+    flipped: Mapping[frozenset[int], FittedSet] = field(default_factory=dict)
+
+    def given(self, unlisted: frozenset[int]) -> FittedSet:
+        """Return the fit about the mode with these groups unlisted."""
+        held = [groups for groups in self.flipped if groups <= unlisted]
+        return self.flipped[max(held, key=len)] if held else self
 
     @property
     def members(self) -> frozenset[str]:
@@ -147,7 +159,13 @@ class FittedSet:
 
     @cached_property
     def quick(self) -> float:
-        """Log p(y | A), near enough to rank sets (`FormFit.quick`)."""
+        """Log p(y | A), near enough to rank sets: without what several unlisted groups gain, where single ones gain
+        little (`FormFit.quick`)."""
+        return self.total if self.single > self.everyday + MOVED else self.single
+
+    @property
+    def single(self) -> float:
+        """Log p(y | A) over no and single unlisted groups, about one mode."""
         return self.shift + log_sum_exp([f.quick + f.log_prior for f in self.forms])
 
     @cached_property
@@ -159,6 +177,11 @@ class FittedSet:
     def by_groups(self) -> Mapping[frozenset[int], float]:
         """Log p(y | A, u) p(u), by which groups are unlisted, summed over the scales of form errors; those far below
         the likeliest count for nothing."""
+        fits = (self, *self.flipped.values())
+        return {u: value for fit in fits for u, value in fit._about_mode.items() if self.given(u) is fit}
+
+    @cached_property
+    def _about_mode(self) -> Mapping[frozenset[int], float]:
         near = [f for f in self.forms if f.quick > self.likeliest.quick - FAR_BELOW]
         sums: dict[frozenset[int], list[float]] = {}
         for form in near:
@@ -169,9 +192,24 @@ class FittedSet:
     @property
     def inexact(self) -> float:
         """Probability that the laws are wrong by more than they declare, given the set."""
+        if self.flipped:
+            fits = (self, *self.flipped.values())
+            own = [[v for u, v in self.by_groups.items() if self.given(u) is fit] for fit in fits]
+            return float(sum(np.exp(log_sum_exp(v) - self.total) * f._inexact for f, v in zip(fits, own, strict=True)))
+        return self._inexact
+
+    @property
+    def _inexact(self) -> float:
         log = [f.quick + f.log_prior for f in self.forms]
         beyond = [w for f, w in zip(self.forms, log, strict=True) if f.form > 1.0]
         return float(np.exp(log_sum_exp(beyond) - log_sum_exp(log))) if beyond else 0.0
+
+    @property
+    def everyday(self) -> float:
+        """Log p(y | A, u) p(u) with all groups everyday."""
+        none = frozenset[int]()
+        own = [f.base - f.start_log + f.scales.everyday + f.scales.log_prior(none) + f.log_prior for f in self.forms]
+        return self.shift + log_sum_exp(own)
 
     @property
     def total(self) -> float:
@@ -404,6 +442,7 @@ class Search:
         """Return the likeliest set without one of its members, from where it stands, if that was never refitted: of all
         members the one nearest to 0, unless even that is excluded."""
         best = max(self.fits.values(), key=self._log_posterior)
+        best = best.given(max(best.by_groups, key=lambda u: best.by_groups[u]))
         places = coordinates_of(self.hypotheses, best.state)
         losses: list[tuple[float, str]] = []
         for name in best.state:
@@ -489,7 +528,7 @@ class Search:
                 modes.append(one)
         total = log_sum_exp([m.base for m in modes])
         merged = replace(best, shift=total - best.base, others=tuple(modes[1:]))
-        merged = self._by_grid_where_weak(merged, estimate)
+        merged = self._with_flips(self._by_grid_where_weak(merged, estimate))
         self.fits[merged.members] = merged
         return merged
 
@@ -531,15 +570,34 @@ class Search:
 
     def fit(self, state: State) -> FittedSet:
         """Return the fit of a set from these parameters, and keep it."""
-        fit = self._fit_at(state)
+        fit = self._with_flips(self._fit_at(state))
         self.fits[fit.members] = fit
         return fit
 
-    def _gaussian(self, state: State, form: float) -> Gaussian:
-        return with_columns(self.model.gaussian(state, form), self._everyday)
+    def _with_flips(self, fit: FittedSet) -> FittedSet:
+        """Return the fit with those about the mode given unlisted groups that make the set likelier than none does:
+        such a mode is another, as the groups explain what a hypothesis would have to."""
+        is_hopeless = self.fits and self._log_posterior(fit) < self._top() - HOPELESS
+        if is_hopeless or not fit.precision.size or fit.single < fit.everyday + MOVED:
+            return fit
+        for _ in range(MOST_MOVED):
+            weights = fit.by_groups
+            best = max(weights, key=lambda u: weights[u])
+            if not best or fit.given(best) is not fit or weights[best] < weights[frozenset()] + MOVED:
+                return fit
+            scales = fit.likeliest.scales.mode(best)
+            fit = replace(fit, flipped={**fit.flipped, best: self._fit_at(fit.state, scales)})
+        return fit
 
-    def _fit_at(self, state: State) -> FittedSet:
+    def _gaussian(self, state: State, form: float, scales: FloatArray | None = None) -> Gaussian:
+        groups = self.model.groups
+        columns = self._everyday if scales is None else scaled_columns(groups, scales, len(self.model.value))
+        return with_columns(self.model.gaussian(state, form), columns)
+
+    def _fit_at(self, state: State, scales: FloatArray | None = None) -> FittedSet:
+        """Return the fit from a state, with the groups at these scales; None: at their median everyday ones."""
         y = self.model.value
+        at = everyday_scales(self.model.groups) if scales is None else scales
         places = coordinates_of(self.hypotheses, state)
         coords = [c for _, _, c in places]
         forms = everyday_forms(self.model.has_form_error(state))
@@ -547,7 +605,10 @@ class Search:
         u = stacked(state)
         if len(u):
             for most in EVALUATIONS:
-                before, u = u, self._mode(moved(state, u), coords, u, self._gaussian(moved(state, u), middle), most)
+                before, u = (
+                    u,
+                    self._mode(moved(state, u), coords, u, self._gaussian(moved(state, u), middle, scales), most),
+                )
                 if np.all(np.abs(u - before) < 1e-3 * np.array([c.unit for c in coords])):
                     break
         state = moved(state, u)
@@ -560,13 +621,16 @@ class Search:
 
         def add(form: FormScale) -> Laplace:
             bare = self.model.gaussian(state, form.share)
-            gaussian = with_columns(bare, self._everyday)
+            gaussian = with_columns(bare, scaled_columns(self.model.groups, at, len(y)))
             white = gaussian.whiten(np.column_stack([jacobian, y - mean]))
-            laplace = self._integral(state, coords, u, gaussian, white[:, :-1], white[:, -1])
-            scales = ScaleIntegral.of(bare, y - mean, self.model.groups, jacobian, precision, pull, self.any_unlisted)
-            start_log = scales.log_likelihood(everyday_scales(self.model.groups))
+            slope = self._slope(state, coords, u, gaussian, white[:, :-1], white[:, -1])
+            laplace = self._integral(state, coords, u, gaussian, white[:, :-1], white[:, -1], slope)
+            free = _within_bounds(coords, u, u + laplace.mean) & (slope == white[:, :-1].T @ white[:, -1])
+            integral = ScaleIntegral.of(
+                bare, y - mean, self.model.groups, jacobian[:, free], precision[free], pull[free], self.any_unlisted
+            )
             base = own + gaussian.log_likelihood(y) + laplace.log_integral
-            fits.append(FormFit(form.share, form.log_prior, base, scales, start_log))
+            fits.append(FormFit(form.share, form.log_prior, base, integral, integral.log_likelihood(at)))
             return laplace
 
         for form in forms:
@@ -615,11 +679,35 @@ class Search:
             columns.append((self.model.mean(moved(state, shifted)) - mean) / (shifted[k] - u[k]))
         return np.array(columns).T if columns else np.zeros((len(mean), 0))
 
-    def _integral(
+    def _slope(
         self, state: State, coords: Sequence[Coordinate], u: FloatArray, gaussian: Gaussian, table: FloatArray,
         r: FloatArray,
+    ) -> FloatArray:  # fmt: skip
+        """Return the slope (p,) of the log likelihood at u about which it is integrated: J'r. Where the linear problem
+        promises a gain within the bounds that the prediction doesn't have there, u isn't its mode, and the linear
+        problem says nothing beyond it: parameters that aren't at a bound are integrated about u."""
+        slope = table.T @ r
+        if not len(u):
+            return slope
+        d, gain = best_within_bounds(table.T @ table, slope, coords, u)
+        if gain < PROMISED:
+            return slope
+        more = zip(coords, u, d, strict=True)
+        prior = sum(float(c.log_prior(float(x + dx)) - c.log_prior(float(x))) for c, x, dx in more)
+        white = gaussian.whiten(self.model.value - self.model.mean(moved(state, u + d)))
+        if prior - 0.5 * (float(white @ white) - float(r @ r)) > 0.5 * gain:
+            return slope
+        low, high = bounds(coords)
+        unit = 1e-6 * np.array([c.unit for c in coords])
+        of_prior = np.array([c.slope_and_precision(float(x))[0] for c, x in zip(coords, u, strict=True)])
+        return np.where((u > low + unit) & (u < high - unit), -of_prior, slope)
+
+    def _integral(
+        self, state: State, coords: Sequence[Coordinate], u: FloatArray, gaussian: Gaussian, table: FloatArray,
+        r: FloatArray, b: FloatArray,
     ) -> Laplace:  # fmt: skip
-        a, b = table.T @ table, table.T @ r
+        """Return the integral over the parameters, given the slope b of the log likelihood at u."""
+        a = table.T @ table
         found = integrate(a, b, coords, u)
         near = near_bound(found, coords, u, NEAR)
         if len(near) != 1:
@@ -713,15 +801,18 @@ class Search:
     def _linearise(self, origin: FittedSet) -> None:
         """Estimate all sets with one, two or three members more than a fitted one: with all groups everyday, and with
         the likeliest of them unlisted where that matters."""
-        weights, gram = origin.by_groups, self._gram(origin)
+        weights = origin.by_groups
         none: frozenset[int] = frozenset()
         best = max(weights, key=lambda u: weights[u])
+        gram = self._gram(origin)
         for unlisted in dict.fromkeys((none, best)):
             if weights[unlisted] > weights[best] - FAR_BELOW or unlisted == none:
-                self._linearise_with(origin, unlisted, gram)
+                about = origin.given(unlisted)
+                self._linearise_with(origin, unlisted, gram if about is origin else self._gram(about))
 
     def _linearise_with(self, origin: FittedSet, unlisted: frozenset[int], whole: FloatArray) -> None:
-        z, gram = self._linear(whole, origin.likeliest.scales.mode(unlisted))
+        scales = origin.given(unlisted).likeliest.scales
+        z, gram = self._linear(whole, scales.mode(unlisted))
         signatures = self._signatures
         owners: dict[str, list[int]] = {}
         for i, s in enumerate(signatures):
@@ -729,7 +820,7 @@ class Search:
                 owners.setdefault(s.owner, []).append(i)
         outside = [i for own in owners.values() for i in own]
         single = dict(zip(outside, integrate_each(z, gram, [signatures[i] for i in outside]), strict=True))
-        ratio = self._averaged_over_scales(origin.likeliest.scales, unlisted, whole, single)
+        ratio = self._averaged_over_scales(scales, unlisted, whole, single)
         gains = {
             o: log_sum_exp([ratio[i] + signatures[i].log_share for i in own]) - float(np.log(len(own)))
             for o, own in owners.items()
@@ -965,6 +1056,14 @@ def _differ(one: FittedSet, other: FittedSet) -> bool:
     std = np.sqrt(np.diag(one.laplace.covariance) + np.diag(other.laplace.covariance))
     away = np.abs(stacked(one.state) - np.concatenate([other.state[n].u for n in one.state]))
     return bool(np.any(away > 2.0 * std))
+
+
+def _within_bounds(coords: Sequence[Coordinate], u: FloatArray, mean: FloatArray) -> np.ndarray:
+    """Return which parameters are marginalised with the groups' scales: those that aren't held at a bound, beyond which
+    the linear problem has its mean. Without bounds they would take what a group explains, with the wrong sign."""
+    low, high = bounds(coords)
+    unit = 1e-3 * np.array([c.unit for c in coords])
+    return np.asarray(~(((mean <= low + unit) & (u <= low + unit)) | ((mean >= high - unit) & (u >= high - unit))))
 
 
 def _choices(point: Point) -> object:

@@ -32,7 +32,7 @@ class ChargeTransferInefficiency(Effect):
     fast and each packet fills the traps to its own level, all that it finds is what the one before has left, whatever
     their release: the noise of that one goes to the next alone (Massey et al., section 2), unless that is so faint that
     the traps, which kept b = exp(-1 / tau) of the one before, hold more than it would fill: it takes none then.
-    Overscan then reads loss x transfers x signal in all lines together, else over 1 - b (`Trails.fills`).
+    Overscan reads loss x transfers x signal of even light in all lines together.
 
     `capture`: losses of many transfers act one after the other, or those of all at once, as models of many transfers
     have it that don't follow each of them (Short et al.): the same for few transfers, less for many.
@@ -125,12 +125,12 @@ class ChargeTransferInefficiency(Effect):
 
     def _trails(self) -> tuple[Trails, ...]:
         """Return the law of each direction that has a loss."""
-        at_once, fills = self.capture == "all at once", self.noise == "to the next packet"
+        at_once = self.capture == "all at once"
         rows: Literal["first", "last"] = "first" if self.first_row == "top" else "last"
         columns: Literal["first", "last"] = "first" if self.first_column == "left" else "last"
         laws = (
-            Trails(0, 1e-6 * self.parallel_ppm, self._releases(self.release_px), rows, at_once, fills),
-            Trails(1, 1e-6 * self.serial_ppm, self._releases(self.serial_release_px), columns, at_once, fills),
+            Trails(0, 1e-6 * self.parallel_ppm, self._releases(self.release_px), rows, at_once),
+            Trails(1, 1e-6 * self.serial_ppm, self._releases(self.serial_release_px), columns, at_once),
         )
         return tuple(law for law in laws if law.loss != 0.0)
 

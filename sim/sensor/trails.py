@@ -32,7 +32,6 @@ class Trails:
     releases : (share of the traps, time constant of their release in transfers) of each species; the shares' sum is 1
     output : whether the first or the last line is next to the output, and so is transferred once
     at_once : whether the traps of all of a packet's transfers act as those of a single one
-    fills : whether each packet fills the traps to its own level, whatever they hold
 
     A packet that is transferred n times loses n loss, and the packet j places behind it finds sum_s w_s (1 - b_s)
     b_s^(j - 1) of that, b_s = exp(-1 / release). With T this delay, the limit of many small losses is exp(n loss (T -
@@ -43,11 +42,10 @@ class Trails:
     g) of the packet; what they release finds them full: 1 + n loss / (1 + g) (T - 1). It is the model of A. Short et
     al., MNRAS 430 (2013) 3078, of the same loss for few transfers, less for many.
 
-    `fills`: capture is fast, and traps that hold charge of packets before take less. Of equal packets they hold that of
-    one, not the sum, so that a margin behind an area of even light reads n loss N in all: the deferred charge by which
-    the extended pixel edge response defines the inefficiency. Where each packet loses its share to traps however full,
-    it is n loss N / (1 - b). Within the active area both are taken alike: the difference is a share loss b / (1 - b) of
-    even light, and edges.
+    Within the active area each packet finds empty traps. Behind it, traps hold what packets have filled them to: that
+    of one of equal packets, not the sum, so that a margin behind even light reads n loss N in all, the deferred charge
+    by which the extended pixel edge response defines the inefficiency (Janesick, section 5.2.2). The law of the active
+    area alone would read n loss N / (1 - b), and takes the share loss b / (1 - b) too much of even light.
     """
 
     axis: Literal[0, 1]
@@ -55,7 +53,6 @@ class Trails:
     releases: tuple[tuple[float, float], ...]
     output: Literal["first", "last"]
     at_once: bool = False
-    fills: bool = False
 
     def transfers(self, line: FloatArray, lines: int) -> FloatArray:
         """Return the number of transfers of lines 0 .. lines - 1, which may lie between two."""
@@ -84,7 +81,7 @@ class Trails:
             packets, ahead, behind = packets[::-1], behind, ahead
         transfers = np.maximum(np.arange(1.0, len(packets) + 1.0) - ahead, 0.0)[:, None]
         read = self._clock_in_order(packets, transfers)
-        if self.fills and behind:
+        if behind:
             read = np.concatenate([read[:-behind], self._read_behind(packets, transfers, behind)])
         return self._as_given(read)
 
@@ -109,19 +106,22 @@ class Trails:
         return read
 
     def _read_behind(self, packets: FloatArray, transfers: FloatArray, behind: int) -> FloatArray:
-        """Return what is read of the `behind` last lines of packets (lines, n), where traps are filled to the level of
-        each packet and keep the most that any has left them."""
+        """Return what is read of the `behind` last lines of packets (lines, n), where each packet has filled the traps
+        to its own level: n loss N, the most of all packets by what is left of it. Where all transfers act at once, a
+        packet N after traps that hold k of the one before fills them to g (N + k) / (1 + g)."""
         lines = np.arange(1.0, behind + 1.0)[:, None]
         before, total = packets[:-behind], packets[-behind:]
         for share, release in self.releases:
             held = float(np.exp(-1.0 / release))
-            left = -np.expm1(-self.loss * share * transfers[:-behind])
+            lost = self.loss * share * transfers[:-behind]
             if self.at_once:
-                left = self.loss * share * transfers[:-behind]
-                left = left / (1.0 + left / held)
-            age = np.arange(len(before) - 1.0, -1.0, -1.0)[:, None]
-            most = np.max(left * before * held**age, axis=0, initial=0.0)
-            total = total + most * (1.0 - held) * held ** (lines - 1.0)
+                left: FloatArray = np.zeros(before.shape[1])
+                for taken, packet in zip(lost / held, before, strict=True):
+                    left = held * np.maximum(left, taken * (packet + left) / (1.0 + taken))
+            else:
+                age = np.arange(len(before) - 1.0, -1.0, -1.0)[:, None]
+                left = np.max(lost * before * held**age, axis=0, initial=0.0)
+            total = total + left * (1.0 - held) * held ** (lines - 1.0)
         return total
 
     def _as_given(self, read: FloatArray) -> FloatArray:

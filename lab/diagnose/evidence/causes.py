@@ -105,7 +105,8 @@ def _cause(
 ) -> Cause:
     table, hypothesis = reading.table, reading.search.hypotheses[law]
     weights = weights_of_sets(table, law)
-    best = table.fits[max(weights, key=lambda key: weights[key])]
+    members_of_best = max(weights, key=lambda key: weights[key])
+    best = table.fits[members_of_best].given(reading.unlisted_with(members_of_best))
     effect = next(e for e in reading.effects_of(best.state) if e.name == law)
     draws = parameter_draws(table, law)
     names = {f.name for f in reading.posterior.findings if f.kind == "effect"}

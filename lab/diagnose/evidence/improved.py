@@ -63,9 +63,9 @@ def improve(
     curves at the posterior mean of their nuisance parameters; and the laws without a name that a state of the camera
     has. Noise and levels are the fit's where there is one; `fit` is of the used captures."""
     laws = frozenset(cause.effect.name for cause in named)
-    found = reading.fit_of(laws) or _likeliest_with(reading, laws)
-    effects = tuple(e for e in reading.effects_of(found.state) if e.name in laws)
     unlisted = frozenset(law.group for law in without_name)
+    found = (reading.fit_of(laws) or _likeliest_with(reading, laws)).given(unlisted)
+    effects = tuple(e for e in reading.effects_of(found.state) if e.name in laws)
     tau = found.likeliest.scales.mode(unlisted)
     disturbances = scaled_columns(reading.problem.groups, tau, len(reading.used.value))
     camera, corrections = _camera(reading, fit, baseline, effects, disturbances, without_name)

@@ -169,7 +169,7 @@ def _unlisted_change(reading: SideTable, state: str) -> _UnlistedChange | None:
     )
     if row is None:
         return None
-    fit = reading.table.fits[row.members]
+    fit = reading.table.fits[row.members].given(row.unlisted)
     before, after = (reading.gaussian(fit, unlisted) for unlisted in (row.unlisted - groups, row.unlisted))
     tau = fit.likeliest.scales.mode(row.unlisted)
     columns = np.column_stack([tau[g] * reading.problem.groups[g].columns for g in groups & row.unlisted])

@@ -101,6 +101,7 @@ class SideTable:
     def gaussian(self, fit: FittedSet, unlisted: frozenset[int]) -> Gaussian:
         """Return the predictive distribution of the used numbers under a set at its mode: theta, form errors and small
         physics marginalised, these groups of it unlisted."""
+        fit = fit.given(unlisted)
         bare = self.model.gaussian(fit.state, fit.likeliest.form)
         tau = fit.likeliest.scales.mode(unlisted)
         return with_columns(bare, scaled_columns(self.problem.groups, tau, len(self.used.value)))

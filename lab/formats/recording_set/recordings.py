@@ -36,11 +36,11 @@ class Summaries:
     @property
     def made(self) -> Summaries:
         """A copy without those that couldn't be made."""
-        one, two = (
-            {key: found for key, found in kept.items() if not isinstance(found, NotDetermined)}
+        of_frames, of_manifest = (
+            {key: summary for key, summary in kept.items() if not isinstance(summary, NotDetermined)}
             for kept in (self.of_frames, self.of_manifest)
         )
-        return Summaries(one, two)
+        return Summaries(of_frames, of_manifest)
 
 
 class RecordingSet(Tabular):
@@ -150,8 +150,8 @@ class RecordingSet(Tabular):
             cache_bytes=self.cache_bytes if cache_bytes is None else cache_bytes,
         )
         if files is None:
-            own = self._summaries.of_manifest if manifest is None else {}
-            copy._summaries = Summaries(self._summaries.of_frames, own)
+            summaries_of_manifest = self._summaries.of_manifest if manifest is None else {}
+            copy._summaries = Summaries(self._summaries.of_frames, summaries_of_manifest)
         return copy
 
     def capture(self, id: str) -> Capture:
@@ -218,10 +218,10 @@ class RecordingSet(Tabular):
                 made = refused
             with self._lock:
                 kept.setdefault(key, made)
-        found = kept[key]
-        if isinstance(found, NotDetermined):
-            raise NotDetermined(found.step, found.reason)
-        return cast(T, found)
+        summary = kept[key]
+        if isinstance(summary, NotDetermined):
+            raise NotDetermined(summary.step, summary.reason)
+        return cast(T, summary)
 
     @property
     def summaries(self) -> Summaries:

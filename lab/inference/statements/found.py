@@ -50,7 +50,8 @@ def wrong_statements(
         weights = weights_of_sets(table, name)
         if not weights:
             continue
-        fit = table.fits[max(weights, key=lambda members: weights[members])]
+        row = next(r for r in table.rows if r.refitted and r.members == max(weights, key=lambda key: weights[key]))
+        fit = table.fits[row.members].given(row.unlisted)
         point, own = fit.state[name], parameter_slice(fit, name)
         restatement: Restatement = point.template
         std = np.sqrt(np.maximum(np.diag(fit.laplace.covariance)[own], 0.0))

@@ -120,8 +120,7 @@ class Statement:
     def hypothesis(self, numbers: Numbers) -> Hypothesis | None:
         """Return the statement as a hypothesis; None where these numbers can't show that it is wrong.
 
-        Of more than `MOST_ALTERNATIVES` alternatives without a size those are kept that fit best about the empty
-        set."""
+        Of more than `MOST_ALTERNATIVES` alternatives those are kept that fit best about the empty set."""
         every = self.restatements(numbers)
         kept = _best(numbers, every) if len(every) > MOST_ALTERNATIVES else list(every)
         if not kept:
@@ -144,11 +143,14 @@ class Statement:
 
 
 def _best(numbers: Numbers, every: Sequence[Restatement]) -> list[Restatement]:
-    """Return the alternatives with the largest likelihood ratios log p(y | m') - log p(y | m) at one covariance."""
+    """Return the alternatives with the largest likelihood ratios log p(y | m') - log p(y | m) at one covariance: of one
+    with a size, of whatever sign, at its likeliest size."""
     gaussian, base = numbers.model.gaussian((), None, 0.0), numbers.model.mean()
     changes = np.column_stack([one.on(numbers)(np.array(one.starts[0])).on_mean(base) - base for one in every])
     white = gaussian.whiten(np.column_stack([changes, numbers.model.value - base]))
-    gain = white[:, :-1].T @ white[:, -1] - 0.5 * np.square(white[:, :-1]).sum(axis=0)
+    z, square = white[:, :-1].T @ white[:, -1], np.maximum(np.square(white[:, :-1]).sum(axis=0), 1e-300)
+    has_size = np.array([bool(one.starts[0]) for one in every])
+    gain = np.where(has_size, 0.5 * np.square(z) / square, z - 0.5 * square)
     return [every[int(k)] for k in np.argsort(-gain)[:MOST_ALTERNATIVES]]
 
 

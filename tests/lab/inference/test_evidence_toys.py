@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal, norm
 from scipy.stats import t as student_t
 
 from lab.inference.hypotheses import Alternative, Coordinate, Hypothesis, SetPrior
-from lab.inference.laplace import integrate, log_box
+from lab.inference.laplace import best_within_bounds, integrate, log_box
 from lab.inference.model import Group, Point, ScaleIntegral
 from lab.inference.search import ANY_UNLISTED, Search
 from sim.spectrum import FloatArray
@@ -50,6 +50,20 @@ def test_several_amplitudes_are_cut_to_their_bounds() -> None:
     mean = np.array([-0.5, 1.0, 0.2])
     exact = np.log(multivariate_normal(-mean, covariance).cdf(np.zeros(3)))
     assert log_box(mean, covariance, np.zeros(3), np.full(3, np.inf)) == pytest.approx(exact, abs=3e-3)
+
+
+def test_the_best_step_within_bounds_is_that_of_a_grid() -> None:
+    """Of two correlated parameters, one of which may only grow: steps of 0.01 about the best cost 2 x 0.01^2 x 4."""
+    coords = [Coordinate("size", 1.0, lower=0.0), Coordinate("other", 1.0)]
+    a, b, u = np.array([[4.0, 3.0], [3.0, 4.0]]), np.array([-2.0, 1.0]), np.array([0.2, 0.1])
+    slope, precision = np.array([c.slope_and_precision(float(x)) for c, x in zip(coords, u, strict=True)]).T
+    grid = np.stack(np.meshgrid(np.arange(-0.2, 1.0, 0.01), np.arange(-1.0, 1.0, 0.01), indexing="ij"), -1)
+    hessian = a + np.diag(precision)
+    gain = grid @ (b + slope) - 0.5 * np.einsum("...i,ij,...j", grid, hessian, grid)
+    step, most = best_within_bounds(a, b, coords, u)
+    assert most == pytest.approx(gain.max(), abs=1e-3)
+    assert step == pytest.approx(grid.reshape(-1, 2)[int(gain.argmax())], abs=0.02)
+    assert step[0] == pytest.approx(-0.2, abs=1e-6)
 
 
 def test_a_flat_shape_that_nothing_determines_costs_nothing() -> None:

@@ -26,8 +26,10 @@ from lab.inference.search import Search
 from lab.inference.statements.found import inclusion, wrong_statements
 from lab.inference.statements.statement import statements
 from lab.inference.statements.structure import exposure_unit_log_odds, weigh_beforehand
+from lab.observables.flats.linearity import measure_photon_transfer
 from sim.effects.library import effect
 from tests.lab.diagnose.metadata.lies import restated, with_dark_exposures, with_exchanged_wavelengths
+from tests.lab.inference.on_blocks import judge
 from tests.lab.inference.toys import Toy, linear
 
 #: Effects that the searches here try beside wrong statements: rivals on dark levels and on spectra.
@@ -193,13 +195,14 @@ def test_a_wrong_exposure_of_darks_is_found(right: RecordingSet, factor: float) 
 
 
 class _WrongShutter(ConcealedCamera):
-    """Frames `wrong` are exposed a tenth longer than is noted."""
+    """Frames `wrong` are exposed `factor` times as long as is noted."""
 
     wrong: range = range(0)
+    factor = 1.1
 
     def expose(self, images: Any, exposure_s: float, k: int, temperature_c: float = 25.0) -> Any:
         """Return the frame of capture k."""
-        return super().expose(images, exposure_s * (1.1 if k in self.wrong else 1.0), k, temperature_c)
+        return super().expose(images, exposure_s * (self.factor if k in self.wrong else 1.0), k, temperature_c)
 
 
 #: Numbers of captures after nine darks: a level of three repeats, and the second of a level's two passes.
@@ -217,6 +220,20 @@ def test_a_wrong_shutter_of_flats_is_found(wrong: range, shuttle: bool) -> None:
     assert abs(float(fits_s) - 1.1 * stated_s) < 3.0 * float(std_s)
     assert examined.searched is not None
     assert not read_table(examined.searched.table, examined.searched.search.hypotheses).named
+
+
+@pytest.mark.parametrize(("wrong", "shuttle", "factor"), [(range(18, 21), False, 1.03), (range(31, 33), True, 0.9)])
+def test_levels_alone_tell_a_wrong_shutter_from_other_causes(wrong: range, shuttle: bool, factor: float) -> None:
+    """A step of a converter and its opposite once promised 50 nats beyond their best fit, where a refit ended beside
+    its mode; and of sixteen places of a shutter those were kept that fit best as longer exposures."""
+    camera = _WrongShutter(3, cfa="MONO", rows=96, cols=128)
+    camera.wrong, camera.factor = wrong, factor
+    found = judge(recordings_of(camera, Plan(("dark", "flat"), shuttle=shuttle)), measure_photon_transfer)
+    assert found.names == ["wrong_exposure"]
+    size = found.size("wrong_exposure", "factor")
+    assert abs(size.mean - factor) < 4.0 * size.std
+    (statement,) = wrong_statements(found.reading.recordings, "left", found.reading.search, found.reading.table)
+    assert statement.captures == tuple(f"c{k:04d}" for k in wrong)
 
 
 def test_a_wrong_black_level_is_found(right: RecordingSet) -> None:

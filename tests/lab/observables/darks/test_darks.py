@@ -39,6 +39,7 @@ from sim.sensor.defects import Defects, defect_sizes, node_std, size_nodes
 from sim.sensor.electrons import FixedPattern
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import signal_of
+from tests.lab.inference.on_blocks import judged
 
 ROWS, COLS = 96, 128
 DRAWN = 24  # cameras
@@ -362,6 +363,14 @@ def test_banding_of_a_fixed_period_is_located_and_gets_no_name() -> None:
     verdict = _verdict(_concealed(92, laws.PeriodicBandingLaw(1.5, 0, 3)))
     assert not verdict.named
     assert "dark_row_noise" in {part.block.measurement.name for part in verdict.after}
+
+
+def test_banding_of_a_fixed_period_is_unlisted_noise_by_line_by_the_evidence() -> None:
+    """Line noise of another spectrum would have to be wrong by two thirds of its own change."""
+    dataset, blocks, _ = _blocks(_concealed(92, laws.PeriodicBandingLaw(1.5, 0, 3)))
+    found = judged(MeasurementModel(tuple(blocks), dataset.camera), dataset)
+    assert not found.names
+    assert set(found.unlisted) == {"noise by line and pixel"}
 
 
 def test_an_offset_of_half_of_the_frame_is_a_tap() -> None:

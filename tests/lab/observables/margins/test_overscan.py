@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from lab.diagnose import diagnose
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.observables.margins.deferred_charge import measure_overscan_charge
@@ -85,3 +86,25 @@ def test_frames_without_margins_have_none_of_it() -> None:
     for make in (measure_overscan_charge, measure_margin_level):
         with pytest.raises(NotDetermined, match="states no margins"):
             make(plain)
+
+
+@pytest.mark.extra  # whole diagnoses
+@pytest.mark.parametrize(
+    ("effect", "parameter"),
+    [
+        (None, ""),
+        (ChargeTransferInefficiency(parallel_ppm=60.0, release_px=1.5), "parallel_ppm"),
+        (BlackLevelDrift(drift_dn_per_min=0.15), "drift_dn_per_min"),
+    ],
+)
+def test_a_diagnosis_sizes_what_margins_show_and_nothing_else(effect: Effect | None, parameter: str) -> None:
+    """Within three of the standard deviations that are reported; no second name, and none of a nominal camera."""
+    found = diagnose(_recorded(*([] if effect is None else [effect]), seed=11), at_once=False)
+    if effect is None:
+        assert (found.verdict, found.effects) == ("no_mismatch", ())
+        return
+    (named,) = found.effects
+    estimate = named.parameters[parameter]
+    assert named.name == effect.name
+    assert estimate.std is not None
+    assert estimate.value == pytest.approx(getattr(effect, parameter), abs=3.0 * estimate.std)

@@ -39,6 +39,7 @@ from sim.scene.scenes import Darkness, UniformField
 from sim.sensor.electrons import FixedPattern, sample_from
 from sim.spectrum import Spectrum
 from tests.lab.diagnose.on_blocks import dataset, former, measured_model, rendered, sigmas
+from tests.lab.inference.on_blocks import judged as search_blocks
 
 SETS = 400  # of frames
 
@@ -330,3 +331,13 @@ def test_hot_pixels_take_nothing_from_the_correlation_of_the_others() -> None:
     black_dn = dataset(recordings).noise.black
     assert found.ordinary["Y"] == pytest.approx(140.0 - black_dn, abs=4.0 * std_dn / np.sqrt(frames * hot.size) + 0.01)
     assert found.signal["Y"] == pytest.approx(140.0 - black_dn + 500.0 * hot.mean(), abs=1.0)
+
+
+def test_capacitance_is_named_by_the_evidence_with_its_size() -> None:
+    """An unlisted process of the correlations takes most of what capacitance does to shot noise. Given that process,
+    charge transfer would have to be small; about its mode without it, its six parameters took the rest for nothing."""
+    dataset = _rendered((effect("inter_pixel_capacitance")(share_percent=1.0, row_excess=0.4, corner_share=0.3),), 8)
+    found = search_blocks(MeasurementModel(_blocks(dataset), dataset.camera), dataset)
+    assert found.names == ["inter_pixel_capacitance"]
+    size = found.size("inter_pixel_capacitance", "share_percent")
+    assert abs(size.mean - 1.0) < 3.5 * size.std
