@@ -692,14 +692,14 @@ class Search:
         d, gain = best_within_bounds(table.T @ table, slope, coords, u)
         if gain < PROMISED:
             return slope
-        more = zip(coords, u, d, strict=True)
-        prior = sum(float(c.log_prior(float(x + dx)) - c.log_prior(float(x))) for c, x, dx in more)
+        at = zip(coords, u, strict=True)
+        of_prior, precision = np.array([c.slope_and_precision(float(x)) for c, x in at]).T
+        prior = float(of_prior @ d - 0.5 * precision @ np.square(d))  # as the linear problem has it
         white = gaussian.whiten(self.model.value - self.model.mean(moved(state, u + d)))
         if prior - 0.5 * (float(white @ white) - float(r @ r)) > 0.5 * gain:
             return slope
         low, high = bounds(coords)
         unit = 1e-6 * np.array([c.unit for c in coords])
-        of_prior = np.array([c.slope_and_precision(float(x))[0] for c, x in zip(coords, u, strict=True)])
         return np.where((u > low + unit) & (u < high - unit), -of_prior, slope)
 
     def _integral(
