@@ -213,7 +213,7 @@ def create_app(
     """Return the application on a store.
 
     `stations`: the folder of the station files, by default `stations` in the data folder. `hosts`: names under which
-    the service is reached, beside this computer's own. `webhook_hosts`: those that may be told of sessions' ends.
+    the service is reached, beside this computer's own. `webhook_hosts`: those that may be notified of sessions' ends.
     `connect` makes a station's drivers. When the application ends, it cancels its jobs and aborts its sessions, which
     can be resumed; shutters are closed. `recovery` may have begun already; by default the application's start begins
     it.

@@ -119,12 +119,12 @@ class _Connection(httpx.Client):
     """Connections whose failures are one line with a remedy."""
 
     def send(self, request: httpx.Request, **options: Any) -> httpx.Response:
-        with _reached(str(self.base_url.copy_with(path="/"))):
+        with _raise_unreachable(str(self.base_url.copy_with(path="/"))):
             return super().send(request, **options)
 
 
 @contextlib.contextmanager
-def _reached(url: str) -> Iterator[None]:
+def _raise_unreachable(url: str) -> Iterator[None]:
     """Raise ServiceUnreachable where httpx doesn't reach the service, or loses it while an answer arrives."""
     try:
         yield
@@ -250,7 +250,7 @@ class ServiceClient:
         partial = file.with_name(f".{file.name}.partial")
         try:
             with (
-                _reached(self.url),
+                _raise_unreachable(self.url),
                 self.http.stream("GET", f"{path}{file.suffix or '.zip'}") as response,
                 partial.open("wb") as to,
             ):
@@ -282,7 +282,7 @@ class ServiceClient:
     def _events(self, path: str) -> Iterator[tuple[str, str]]:
         """(name, data) of each event of a stream, as it arrives."""
         name = ""
-        with _reached(self.url), self.http.stream("GET", path, timeout=EVENTS_S) as response:
+        with _raise_unreachable(self.url), self.http.stream("GET", path, timeout=EVENTS_S) as response:
             if response.is_error:
                 response.read()
                 raise _problem(response)

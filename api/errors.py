@@ -182,7 +182,7 @@ def _invalid(request: Request, error: Exception) -> Response:
     return problem(422, request.app.state.public("; ".join(lines)))
 
 
-def _refused(request: Request, error: Exception) -> Response:
+def _answer_refusal(request: Request, error: Exception) -> Response:
     """Return what a route or the router refuses; of a wrong method, `Allow` names the methods of all routes of the
     path."""
     assert isinstance(error, RouterException)
@@ -211,13 +211,13 @@ class DefectMiddleware:
         """Handle one request."""
         begun = False
 
-        async def watched(message: Message) -> None:
+        async def watch(message: Message) -> None:
             nonlocal begun
             begun = True
             await send(message)
 
         try:
-            await self.app(scope, receive, watched)
+            await self.app(scope, receive, watch)
         except ClientDisconnect:  # there is nobody to answer
             log.info("%s %s: the client broke off", scope.get("method"), scope.get("path"))
         except Exception as error:
@@ -241,4 +241,4 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(CannotWrite, _answer(503))
     app.add_exception_handler(Conflict, _answer(409))
     app.add_exception_handler(RequestValidationError, _invalid)
-    app.add_exception_handler(RouterException, _refused)
+    app.add_exception_handler(RouterException, _answer_refusal)

@@ -15,7 +15,15 @@ KEEP_ALIVE_S = 15.0
 
 
 def event(name: str, content: BaseModel) -> ServerSentEvent:
-    """Return an event with a schema as its data."""
+    """Return an event of a stream.
+
+    name : of the event
+    content : its data
+
+    >>> from lab.formats.results import FitResult
+    >>> event("end", FitResult(source="my-camera", cameras={})).event
+    'end'
+    """
     return ServerSentEvent(event=name, data=content.model_dump_json())
 
 
@@ -57,7 +65,13 @@ async def watch_state(
 
 
 def describe_events(*events: tuple[str, type[BaseModel], str]) -> dict[int | str, dict[str, Any]]:
-    """Return OpenAPI's description of a stream: each event's name, its data, and when it is sent."""
+    """Return OpenAPI's description of a stream.
+
+    events : name, type of the data, and when it is sent, of each
+
+    >>> list(describe_events(("end", BaseModel, "when it is over")))
+    [200]
+    """
     lines = [f"- `{name}`: {when}; its data is a `{model.__name__}`." for name, model, when in events]
     schema = {
         "type": "string",

@@ -96,7 +96,7 @@ class Idempotency:
             sent = True
             return {"type": "http.request", "body": body, "more_body": False}
 
-        async def noted(message: Message) -> None:
+        async def keep_answer(message: Message) -> None:
             nonlocal status, location, answer
             if message["type"] == "http.response.start":
                 status, location = message["status"], MutableHeaders(scope=message).get("location", "")
@@ -107,7 +107,7 @@ class Idempotency:
             await send(message)
 
         try:
-            await self.app(scope, again, noted)
+            await self.app(scope, again, keep_answer)
         except BaseException:
             await asyncio.to_thread(self._end, id, 500, "", "")
             raise

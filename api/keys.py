@@ -173,7 +173,10 @@ def is_loopback(host: str) -> bool:
 
 
 def check_bind(host: str, keys: Iterable[StoredKey]) -> None:
-    """Raises InputError for a service without keys that other computers could reach."""
+    """Check where the service listens. Raises InputError for a service without keys that other computers could reach.
+
+    >>> check_bind("127.0.0.1", [])
+    """
     if not is_loopback(host) and not any(True for _ in keys):
         raise InputError(
             f"--host {host}: others could reach this service, and it has no key; "

@@ -14,7 +14,7 @@ from functools import partial
 import anyio
 
 from api.errors import Conflict
-from api.safety import KnownSafety, StationSafety, key_of
+from api.safety import KnownSafety, StationSafety, shutter_key
 from lab.calibration.life import check_certified
 from lab.capture.blocking_calls import in_thread
 from lab.capture.plan import CapturePlan, full_plan
@@ -93,15 +93,15 @@ class LiveSession:
                 self._safety.note(self.station, StationSafety.of(capture.safe))
             elif self._known_before is not None:  # it took no instruments up
                 self._safety.note(self.station, self._known_before)
-            self._changed(ended=True)
+            self._note_change(ended=True)
 
     def tell(self, progress: Progress) -> None:
         """Called by the run, from its thread, at every progress."""
         if progress.state != "running":
             self.pausing = False
-        self._changed(progress)
+        self._note_change(progress)
 
-    def _changed(self, progress: Progress | None = None, ended: bool = False) -> None:
+    def _note_change(self, progress: Progress | None = None, ended: bool = False) -> None:
         with self._lock:
             was = self._latest.state if self._latest is not None else None
             asked = self._latest.asks if self._latest is not None else None
@@ -127,7 +127,7 @@ class LiveSession:
 
     def nudge(self) -> None:
         """Wake the followers, because the session's state changed without progress."""
-        self._changed()
+        self._note_change()
 
     async def follow(self, stopping: anyio.Event) -> AsyncIterator[Progress]:
         """Yield the latest progress, then later ones, until the run ends or the service stops. A slow follower misses
@@ -273,7 +273,7 @@ class LiveSessions:
         pipeline begins isn't resumed."""
         under_way = frozenset(id for id, live in list(self._live.items()) if not live.ended)
 
-        def captured(request: CaptureRequest, tell: Callable[[Progress], None]) -> str:
+        def capture_session(request: CaptureRequest, tell: Callable[[Progress], None]) -> str:
             session_id = request.session
             try:
                 if not session_id:
@@ -300,7 +300,7 @@ class LiveSessions:
                 return session_id
             raise DeviceError(f"session {session_id} is {info.state}: {info.error}; resume it and start the job again")
 
-        return captured
+        return capture_session
 
     def _end(self, session_id: str, live: LiveSession) -> None:
         """Abort a run and wait for its end."""
@@ -360,10 +360,10 @@ class LiveSessions:
         under way shares it, as a second connection would be refused.
         """
         with self._asking:
-            under_way = self._asked.get(key_of(station))
+            under_way = self._asked.get(shutter_key(station))
             if under_way is None or under_way.done():
                 self.safety.note_asked(station)
-                under_way = self._asked[key_of(station)] = in_thread(partial(self._make_safe, station, session_id))
+                under_way = self._asked[shutter_key(station)] = in_thread(partial(self._make_safe, station, session_id))
             return under_way
 
     def _make_safe(self, station: Station, session_id: str) -> None:

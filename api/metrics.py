@@ -70,7 +70,7 @@ class CountedRequests:
             return
         began_s = time.perf_counter()
 
-        async def noted(message: Message) -> None:
+        async def note(message: Message) -> None:
             if message["type"] == "http.response.start":
                 # A request that no route takes has no path of its own; a method that nobody uses is no label, either.
                 route = getattr(scope.get("route"), "path", "none")
@@ -78,4 +78,4 @@ class CountedRequests:
                 self.metrics.count_response(method, route, message["status"], time.perf_counter() - began_s)
             await send(message)
 
-        await self.app(scope, receive, noted)
+        await self.app(scope, receive, note)

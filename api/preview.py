@@ -23,9 +23,17 @@ WEBP_QUALITY = 80
 def preview(
     frame: NDArray[np.uint16], camera: DataSheet, width_px: int, stretch: bool = False, form: Form = "png"
 ) -> bytes:
-    """Return a picture of `frame` (rows, cols), at most `width_px` wide, lossless as PNG or small as WebP. Black is the
-    data sheet's black level, white its white level, or with `stretch` the frame's own 99.9th percentile, so that dark
-    frames show what is in them. No white balance."""
+    """Return a picture of a frame, lossless as PNG or small as WebP. There is no white balance.
+
+    frame : (rows, cols), DN
+    camera : its data sheet; black is its black level, white its white level
+    width_px : greatest width
+    stretch : take the frame's 99.9th percentile as white, so that dark frames show what is in them
+
+    >>> sheet = DataSheet(rows=4, cols=4, cfa="MONO", bit_depth=12)
+    >>> preview(np.zeros((4, 4), np.uint16), sheet, 4)[1:4]
+    b'PNG'
+    """
     black = camera.black_level_dn or 0.0
     mosaic = {name: plane.astype(np.float32) for name, plane in planes(frame, camera.cfa).items()}
     if camera.cfa == "MONO":

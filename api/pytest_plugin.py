@@ -47,7 +47,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @dataclass(frozen=True)
 class MockBench:
-    """A running mock bench. `conceals`: what it was told to."""
+    """A running mock bench. `conceals`: as the option states it."""
 
     station_file: Path
     conceals: tuple[str, ...]

@@ -48,7 +48,7 @@ class KnownSafety:
         self._known: dict[str, StationSafety] = {}
         names: set[str] = set()
         for info in store.sessions(None, LOOKED_AT):  # the newest first
-            if info.state in ("created", "queued") or (key := key_of(store.station(info.id))) in names:
+            if info.state in ("created", "queued") or (key := shutter_key(store.station(info.id))) in names:
                 continue
             names.add(key)
             if info.state == "failed" and UNSAFE in (info.error or ""):
@@ -59,16 +59,16 @@ class KnownSafety:
     def find(self, station: Station) -> StationSafety | None:
         """Return what is known of a station; None where its instruments haven't answered since the service's start, or
         a run uses them now."""
-        return self._known.get(key_of(station))
+        return self._known.get(shutter_key(station))
 
     def note(self, station: Station, safety: StationSafety | None) -> None:
         """Keep what is known now, unless something newer is."""
         with self._lock:
-            before = self._known.get(key_of(station))
+            before = self._known.get(shutter_key(station))
             if safety is None:
-                self._known.pop(key_of(station), None)
+                self._known.pop(shutter_key(station), None)
             elif before is None or before.at <= safety.at:
-                self._known[key_of(station)] = safety
+                self._known[shutter_key(station)] = safety
         self._changed()
 
     def note_found(self, station: Station, state: SafeState) -> None:
@@ -88,7 +88,7 @@ class KnownSafety:
         self.note(station, StationSafety(state="not confirmed", shutter="unknown", at=now(), words=words))
 
 
-def key_of(station: Station) -> str:
+def shutter_key(station: Station) -> str:
     """Return what tells stations apart that have shutters of their own."""
     monochromator = station.monochromator
     return (

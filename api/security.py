@@ -305,7 +305,7 @@ class SmallBodies:
             return
         taken = 0
 
-        async def counted() -> Message:
+        async def count_bytes() -> Message:
             nonlocal taken
             message: Message = await receive()
             taken += len(message.get("body", b""))
@@ -315,7 +315,7 @@ class SmallBodies:
                 )  # FastAPI's, while it reads the body
             return message
 
-        await self.app(scope, counted, send)
+        await self.app(scope, count_bytes, send)
 
     @property
     def _why(self) -> str:

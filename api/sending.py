@@ -12,7 +12,7 @@ from fastapi import HTTPException, Request
 
 from api.service import Service
 from api.unpacking import TooMuch, check_room
-from api.upload import as_in_archive, check_size, receive
+from api.upload import check_size, name_as_in_archive, receive
 from lab.errors import FULL, NoRoom
 
 #: What an archive may be; its own first bytes say which it is.
@@ -37,7 +37,7 @@ class Arrived:
 
     def name_as_sent(self, text: str) -> str:
         """Return a sentence about its files, which names them as in the archive."""
-        return self.service.public(as_in_archive(text, self.place))
+        return self.service.public(name_as_in_archive(text, self.place))
 
 
 @contextlib.asynccontextmanager

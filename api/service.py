@@ -174,7 +174,7 @@ class Service:
 
 
 def missing_session(session_id: str) -> str:
-    """Return what is said of a session that isn't there.
+    """Return the message on a session that isn't there.
 
     >>> missing_session("20300101")
     "no session '20300101'; GET /api/v1/sessions lists them"

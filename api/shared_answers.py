@@ -77,7 +77,7 @@ class SharedAnswers:
             await self.app(scope, receive, send)
         elif scope["method"] not in ("GET", "HEAD"):
             await self._change(scope, receive, send)
-        elif scope["method"] == "GET" and self.busy() and self._shareable(scope) and await self._known(scope):
+        elif scope["method"] == "GET" and self.busy() and self._shareable(scope) and await self._may_read(scope):
             await self._share(scope, receive, send)
         else:
             await self.app(scope, receive, send)
@@ -86,7 +86,7 @@ class SharedAnswers:
         conditional = any(name in (b"if-none-match", b"range") for name, _ in scope["headers"])
         return not conditional and _SHARED.match(scope["path"], len(self.prefix)) is not None
 
-    async def _known(self, scope: Scope) -> bool:
+    async def _may_read(self, scope: Scope) -> bool:
         """Return whether the request has a key that may read; where it hasn't, the route says so."""
         gate, request = self.gate, Request(scope)
         try:
@@ -98,13 +98,13 @@ class SharedAnswers:
     async def _change(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a change on; whoever hears of it is answered anew."""
 
-        async def told(message: Message) -> None:
+        async def pass_on(message: Message) -> None:
             if message["type"] == "http.response.start":
                 self.shared.forget()
             await send(message)
 
         try:
-            await self.app(scope, receive, told)
+            await self.app(scope, receive, pass_on)
         finally:
             self.shared.forget()
 
@@ -121,7 +121,7 @@ class SharedAnswers:
         mine = self.shared.begin(asked)
         status = 0
 
-        async def noted(message: Message) -> None:
+        async def keep(message: Message) -> None:
             nonlocal status
             if message["type"] == "http.response.start":
                 status, mine.headers, mine.route = message["status"], tuple(message["headers"]), scope.get("route")
@@ -133,6 +133,6 @@ class SharedAnswers:
             await send(message)
 
         try:
-            await self.app(scope, receive, noted)
+            await self.app(scope, receive, keep)
         finally:
             mine.made.set()

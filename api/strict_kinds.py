@@ -20,8 +20,13 @@ def _kinds(annotation: Any) -> set[Any]:
 
 
 def check_kind(where: str, value: Any, annotation: Any) -> None:
-    """Raise ValueError where the value at `where` would only be taken for what the annotation says after a
-    conversion."""
+    """Check that a value has the kind that an annotation states, without a conversion. Raises ValueError where it
+    hasn't.
+
+    where : of the value, for the message
+
+    >>> check_kind("exposure_s", 0.1, float)
+    """
     kinds = _kinds(annotation)
     _check(where, value, kinds - {type(None), Ellipsis}, none_allowed=type(None) in kinds)
 

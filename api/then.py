@@ -82,7 +82,14 @@ def then_of(store: Store, session_id: str) -> ThenState | None:
 
 
 def check_webhook(url: str | None, hosts: Collection[str]) -> None:
-    """Raises 422 for a webhook on a host that the service wasn't started with."""
+    """Check the address that is notified of a session's end. Raises 422 for a host that the service wasn't started
+    with.
+
+    url : None: nobody is notified
+    hosts : of `calibench serve --webhook-host`
+
+    >>> check_webhook("https://lab.example/ended", ["lab.example"])
+    """
     if url is None:
         return
     host = (urlsplit(url).hostname or "").lower()

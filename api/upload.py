@@ -155,13 +155,13 @@ class Inbox:
                 recordings = recording.read(_top(sent))
             else:
                 recordings = foreign.read(_top(sent, None))
-                notes = as_in_archive(recordings.manifest.notes, place)
+                notes = name_as_in_archive(recordings.manifest.notes, place)
                 recordings = recordings.under(recordings.manifest.model_copy(update={"notes": notes}))
                 warnings: list[str] = []
-                recording.write(recordings, unpacked, told=warnings.extend)
+                recording.write(recordings, unpacked, report_warnings=warnings.extend)
                 recordings.warnings += tuple(warnings)
         except InputError as error:
-            raise InputError(as_in_archive(str(error), place)) from None
+            raise InputError(name_as_in_archive(str(error), place)) from None
         recordings.warnings = (*remarks, *recordings.warnings)
         id = secrets.token_hex(8)
         unpacked.rename(self.root / id)
@@ -206,7 +206,7 @@ def take_cameras(place: Path, archive: Path, limit_bytes: int) -> dict[Side, Cam
     except TooMuch:
         raise
     except InputError as error:
-        raise InputError(as_in_archive(str(error), place)) from None
+        raise InputError(name_as_in_archive(str(error), place)) from None
     except (zipfile.BadZipFile, MemoryError) as error:
         raise InputError(f"the archive's arrays can't be read ({type(error).__name__}); save them with numpy") from None
 
@@ -220,7 +220,7 @@ def _top(folder: Path, holds: str | None = _MANIFEST) -> Path:
     return inner[0] if not is_holder and len(inner) == 1 else folder
 
 
-def as_in_archive(text: str, place: Path) -> str:
+def name_as_in_archive(text: str, place: Path) -> str:
     """Return a message with the archive's files named as in the archive."""
     for part in ("set", "sent"):
         for top in place.glob(f"{part}/*"):

@@ -12,8 +12,21 @@ from sim.spectrum import Spectrum
 
 
 def read_calibration(path: str, columns: list[str], who: str) -> Spectrum:
-    """Return the curve of a file whose first line names `columns`. Raises `InstrumentError`, one line that begins with
-    `who`."""
+    r"""Return the curve of a calibration file.
+
+    path : CSV
+    columns : names that its first line has
+    who : beginning of the message
+
+    Raises `InstrumentError`, one line.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "diode.csv"
+    ...     _ = file.write_text("wavelength_nm,responsivity_a_per_w\n400,0.2\n500,0.3\n")
+    ...     read_calibration(str(file), ["wavelength_nm", "responsivity_a_per_w"], "photodiode").value
+    (0.2, 0.3)
+    """
     file = Path(path)
     try:
         with file.open(newline="", encoding="utf-8") as lines:

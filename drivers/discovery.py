@@ -1,8 +1,7 @@
 """What is connected to this computer, and which driver reaches it.
 
-USB devices are told by their identifiers; cameras by the libraries that enumerate them. What stands on a serial port
-says nothing by
-itself: `probe` asks each serial driver to connect.
+USB devices are recognised by their identifiers; cameras by the libraries that enumerate them. What stands on a serial
+port says nothing by itself: `probe` asks each serial driver to connect.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ class Program(Transport):
         Raises `NoAnswer`, `Disconnected` with the program's last line where it ended, `Garbled` or `Interrupted`.
         """
         end = time.monotonic() + timeout_s
-        while (found := prompts.search(self._received)) is None:
+        while (match := prompts.search(self._received)) is None:
             if len(self._received) > LONGEST_ANSWER:
                 raise Garbled(f"{self.name}: sends without end; check that `program` is the right one")
             if self._heeds and self._interrupted.is_set():
@@ -124,8 +124,8 @@ class Program(Transport):
                     f"{self.name}: {got} within {timeout_s:g} s to {asked!r}; check the instrument's cable, and that "
                     "no other program uses it"
                 )
-        assert found.lastgroup is not None
-        return self._take(found.end()), found.lastgroup
+        assert match.lastgroup is not None
+        return self._take(match.end()), match.lastgroup
 
     def _receive(self, timeout_s: float) -> bool:
         process = self._running()

@@ -77,7 +77,7 @@ class TranscriptFile:
 
 
 def _unescape(text: str, number: int) -> bytes:
-    def one(match: re.Match[bytes]) -> bytes:
+    def unescape(match: re.Match[bytes]) -> bytes:
         escape = match[0]
         if escape.startswith(b"\\x") and len(escape) == 4:
             return bytes((int(escape[2:], 16),))
@@ -86,6 +86,6 @@ def _unescape(text: str, number: int) -> bytes:
         return _ESCAPES[escape]
 
     try:
-        return re.sub(rb"\\(x[0-9a-fA-F]{2}|.|$)", one, text.encode("ascii"))
+        return re.sub(rb"\\(x[0-9a-fA-F]{2}|.|$)", unescape, text.encode("ascii"))
     except UnicodeEncodeError:
         raise ValueError(f"line {number}: not ASCII; escape it as \\xHH") from None

@@ -254,14 +254,15 @@ def third_party_command(
     if missing:
         raise InputError(f"{' and '.join(missing)}: not installed; `make third-party` installs what is needed")
     from evaluation.third_party import experiment  # needs the simulators
-    from evaluation.third_party.score import table
+    from evaluation.third_party.score import size_table, table
 
     check_writable(out)
     check_writable(page)
     unknown = sorted(set(effect or ()) - set(experiment.SOURCES))
     if unknown:
         raise InputError(f"--effect {unknown[0]}: no such model; there are {', '.join(experiment.SOURCES)}")
-    text = table(experiment.diagnose_sets(out, sets, tuple(effect or experiment.SOURCES)))
+    results = experiment.diagnose_sets(out, sets, tuple(effect or experiment.SOURCES))
+    text = f"{table(results)}\n\n{size_table(results)}"
     print(text)
     if page is not None:
         page.write_text(placed(page.read_text(encoding="utf-8"), "third-party", text), encoding="utf-8")

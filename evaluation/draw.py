@@ -24,10 +24,9 @@ from evaluation.independent_simulator import (
     record,
     record_pair,
 )
-from evaluation.noncentrality import FairStrength, fair_strengths, library_changes, noncentrality, summaries
+from evaluation.noncentrality import FairStrength, Summaries, fair_strengths, library_changes, noncentrality, summaries
 from evaluation.rig_errors import RigErrors
 from evaluation.truth import SIZES, CaseTruth, Concealed, Kind
-from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.formats.recording_set import Manifest, RecordingSet
 from sim.spectrum import Spectrum
 
@@ -335,11 +334,11 @@ def _sized(
         return _Sized([], [], [], None)
 
     @lru_cache(maxsize=4)
-    def both(present: tuple[Law, ...]) -> list[MeasurementModel | None]:
+    def both(present: tuple[Law, ...]) -> list[Summaries | None]:
         found = {k: summaries(recording_set(take(present, k))) for k in set(draws)}
         return [found[k] for k in draws]
 
-    def shown(present: list[MeasurementModel | None], absent: list[MeasurementModel | None]) -> float:
+    def shown(present: list[Summaries | None], absent: list[Summaries | None]) -> float:
         return noncentrality(list(zip(present, absent, strict=True)))
 
     none = both(())
@@ -369,7 +368,7 @@ def _sized(
 
 
 def _without(
-    both: Callable[[tuple[Law, ...]], list[MeasurementModel | None]], laws: list[Law]
-) -> list[list[MeasurementModel | None]]:
+    both: Callable[[tuple[Law, ...]], list[Summaries | None]], laws: list[Law]
+) -> list[list[Summaries | None]]:
     """Return the summaries without each of the laws."""
     return [both(tuple(one for one in laws if one is not law)) for law in laws]

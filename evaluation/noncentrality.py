@@ -3,8 +3,10 @@ identified.
 
 Summaries are the measured numbers of a diagnosis. Recordings with and without the law are of the same camera with the
 same noise, so that their difference is the law's change. Its covariance is that of the recordings with the law,
-nuisance parameters marginalised. The library of effects has no part in the non-centrality. It enters as rivals, by its
-effects' changes of the healthy camera (`evaluation.noncentrality`).
+nuisance parameters and everyday small physics marginalised: what the model calls everyday isn't strong. Which law it
+is, is known less well still: separability and the oracle have the errors of the concealed laws, at their declared form
+tolerances, in the covariance, too. The library of effects has no part in the non-centrality. It enters as rivals, by
+its effects' changes of the healthy camera (`evaluation.noncentrality`).
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -22,6 +25,8 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
+from lab.inference.discrepancy import depends_not_on_axis, groups_of, law_error, observable_kernel
+from lab.inference.model import scaled_columns
 from lab.observables.dataset import Dataset
 from lab.observables.observable import measurements
 from sim.effects.library import candidates
@@ -30,9 +35,9 @@ from sim.spectrum import FloatArray
 # --- fair strength ---------------------------------------------------------------------------------------------------
 # How well the concealed laws of one case can be identified at best: a linear Gaussian problem.
 #
-# All vectors are changes of the summaries (the measured numbers), (n,), whitened: noise has unit variance, and nuisance
-# parameters are marginalised. P[J] is the projection orthogonal to directions J, and d the change by the concealed law
-# i:
+# All vectors are changes of the summaries (the measured numbers), (n,), whitened: noise, everyday small physics and the
+# laws' form errors have unit variance together, and nuisance parameters are marginalised. P[J] is the projection
+# orthogonal to directions J, and d the change by the concealed law i:
 #
 #     conditional non-centrality   lambda(i | j) = |P[J_j] d|^2               the part that the other concealed law
 # can't
@@ -159,11 +164,26 @@ def _prices(bases: Sequence[FloatArray], rng: np.random.Generator) -> list[float
 # --- noncentrality ------------------------------------------------------------
 
 
-#: Measurement models of one camera with two draws of the noise.
-TwoDraws = Sequence[MeasurementModel | None]
+@dataclass(frozen=True)
+class Summaries:
+    """The summaries of a single camera's recordings."""
+
+    model: MeasurementModel
+    dataset: Dataset
+
+    @cached_property
+    def everyday(self) -> FloatArray:
+        """Changes (n, R) by everyday small physics, whose coefficients are independent standard normal numbers."""
+        n = len(self.model.value)
+        groups = groups_of(self.model, self.dataset, n)
+        return scaled_columns(groups, np.array([g.everyday for g in groups]), n)
 
 
-def summaries(recordings: RecordingSet) -> MeasurementModel | None:
+#: Summaries of one camera with two draws of the noise.
+TwoDraws = Sequence[Summaries | None]
+
+
+def summaries(recordings: RecordingSet) -> Summaries | None:
     """Return the summaries of a single camera's recordings; None where no measurement is determined."""
     dataset = Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
     blocks = []
@@ -172,14 +192,14 @@ def summaries(recordings: RecordingSet) -> MeasurementModel | None:
             blocks.append(measurement.make(dataset))
         except NotDetermined:
             continue
-    return MeasurementModel(tuple(blocks), dataset.camera) if blocks else None
+    return Summaries(MeasurementModel(tuple(blocks), dataset.camera), dataset) if blocks else None
 
 
-def _keys(found: MeasurementModel) -> list[Hashable]:
+def _keys(found: Summaries) -> list[Hashable]:
     """Return a key for each summary, the same in all recordings of one session."""
     count: Counter[Hashable] = Counter()
     keys: list[Hashable] = []
-    for block in found.blocks:
+    for block in found.model.blocks:
         for label in block.labels:
             key = block.measurement.name, label.channel, label.condition, label.captures
             keys.append((key, count[key]))
@@ -187,19 +207,39 @@ def _keys(found: MeasurementModel) -> list[Hashable]:
     return keys
 
 
-def _change(present: MeasurementModel, absent: MeasurementModel) -> dict[Hashable, float]:
+def _change(present: Summaries, absent: Summaries) -> dict[Hashable, float]:
     """Key -> change by the law, of every summary that both have and that isn't held out."""
-    other = dict(zip(_keys(absent), absent.value, strict=True))
-    seen = zip(_keys(present), present.value, present.seen, strict=True)
+    other = dict(zip(_keys(absent), absent.model.value, strict=True))
+    seen = zip(_keys(present), present.model.value, present.model.seen, strict=True)
     return {key: value - other[key] for key, value, use in seen if use and key in other}
 
 
-def noncentrality(pairs: Sequence[tuple[MeasurementModel | None, MeasurementModel | None]]) -> float:
+def _covariance(
+    present: Summaries, changes: Sequence[FloatArray] = (), effects: Sequence[str | None] = ()
+) -> FloatArray:
+    """Covariance (n, n) of the summaries under the baseline, with everyday small physics, and with the errors of
+    effects' laws at their form tolerances, given the laws' changes (n,)."""
+    model = present.model
+    total = model.gaussian(()).covariance + present.everyday @ present.everyday.T
+    laws = {kind.name: kind for kind in candidates()}
+    for change, name in zip(changes, effects, strict=True):
+        if name not in laws:
+            continue
+        for block, at in zip(model.blocks, model.slices, strict=True):
+            if change[at].any():
+                is_invariant = depends_not_on_axis(block, laws[name])
+                kernel = observable_kernel(block, is_invariant=is_invariant)
+                error = laws[name].form_tolerance * change[at]
+                total[at, at] += law_error(block, kernel, error, is_invariant)
+    return np.asarray(total)
+
+
+def noncentrality(pairs: Sequence[tuple[Summaries | None, Summaries | None]]) -> float:
     """d1' C^-1 d2, at least 0, of two pairs (with the law, without it), each with its own draw of the noise.
 
-    d is the change of the summaries, C their covariance under the baseline, from the first recordings with the law. A
-    law that moves an edge changes the noise under it, too. That part is independent in d1 and d2 and cancels on
-    average; |d|^2 of one pair would be biased by it.
+    d is the change of the summaries, C their covariance under the baseline with everyday small physics, from the first
+    recordings with the law. A law that moves an edge changes the noise under it, too. That part is independent in d1
+    and d2 and cancels on average; |d|^2 of one pair would be biased by it.
     """
     (present, absent), (again, without) = pairs
     if present is None or absent is None or again is None or without is None:
@@ -210,7 +250,7 @@ def noncentrality(pairs: Sequence[tuple[MeasurementModel | None, MeasurementMode
     if not where.any():
         return 0.0
     first, second = (np.array([d[key] for key, use in zip(keys, where, strict=True) if use]) for d in (one, two))
-    covariance = present.gaussian(()).covariance[np.ix_(where, where)]
+    covariance = _covariance(present)[np.ix_(where, where)]
     return max(float(first @ cho_solve(cho_factor(covariance, lower=True), second)), 0.0)
 
 
@@ -231,16 +271,17 @@ class LibraryChanges:
     changes: tuple[tuple[str, FloatArray], ...]  # name and changes (n, prototypes) of each set of prototypes
 
 
-def library_changes(healthy: MeasurementModel | None) -> LibraryChanges:
+def library_changes(healthy: Summaries | None) -> LibraryChanges:
     """Return the changes by every candidate about the healthy camera; none where no measurement is determined."""
     if healthy is None:
         return LibraryChanges({}, ())
-    base = healthy.mean()
+    model = healthy.model
+    base = model.mean()
     found = [
-        (effect.name, np.stack([healthy.mean((one,)) - base for one in prototypes], axis=1))
+        (effect.name, np.stack([model.mean((one,)) - base for one in prototypes], axis=1))
         for effect in candidates()
-        if healthy.affected(effect).any()
-        for prototypes in effect.prototypes(healthy.camera)
+        if model.affected(effect).any()
+        for prototypes in effect.prototypes(model.camera)
     ]
     return LibraryChanges({key: row for row, key in enumerate(_keys(healthy))}, tuple(found))
 
@@ -270,12 +311,15 @@ def fair_strengths(
     if not where.any():
         return [FairStrength(None, None, None) for _ in without], None
     common = [key for key, use in zip(keys, where, strict=True) if use]
-    lower = cholesky(present.gaussian(()).covariance[np.ix_(where, where)], lower=True)
+    one, two = (np.array([[pair[k][key] for pair in tables] for key in common]) for k in (0, 1))
+    mean = np.zeros((len(keys), len(tables)))
+    mean[where] = 0.5 * (one + two)
+    lower = cholesky(_covariance(present, list(mean.T), effects)[np.ix_(where, where)], lower=True)
 
     def white(table: FloatArray) -> FloatArray:
         return np.asarray(solve_triangular(lower, table, lower=True))
 
-    first, second = (white(np.array([[pair[k][key] for pair in tables] for key in common])) for k in (0, 1))
+    first, second = white(one), white(two)
     own = 0.5 * (first + second)
     rows = [library.row[key] for key in common]
     listed: list[Directions] = []

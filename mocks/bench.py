@@ -66,6 +66,7 @@ from sim.memory import return_freed_memory
 from sim.scene import Scene, ScreenPattern, UniformField
 from sim.scene.render import Grid, cells, quadrilateral
 from sim.sensor.electrons import sample_from
+from sim.sensor.margins import NO_MARGINS, Margins
 from sim.sensor.shot import draw_poisson
 from sim.spectrum import FloatArray, Spectrum
 from sim.stop_down import at_f_number, effects_at_f_number
@@ -119,7 +120,8 @@ class Bench:
     """The light path, the stage and both cameras; see the module's docstring.
 
     `seed` fixes the hidden truth and the noise; `concealed` replaces what the cameras conceal (default:
-    `mocks.truth.CONCEALED`). `shape` is that of the frames. `warm_up_c`: by how much the sensors get warmer after the
+    `mocks.truth.CONCEALED`). `shape` is that of the area that sees light, and `margins` surround it in the frames.
+    `warm_up_c`: by how much the sensors get warmer after the
     bench was switched on. `session_clock` (s) is the one that a session dates its frames with: effects of time follow
     it; None: the virtual clock. Every public method may be called from any thread. Raises `mocks.conceal.ConcealError`
     for what it can't show."""
@@ -131,11 +133,12 @@ class Bench:
         concealed: Concealed | None = None,
         *,
         shape: tuple[int, int] = (ROWS, COLS),
+        margins: Margins = NO_MARGINS,
         warm_up_c: float = 0.0,
         session_clock: Callable[[], float] | None = None,
     ) -> None:
         self._lock = threading.RLock()
-        self._truth: Truth = hidden_truth(seed, concealed, shape)
+        self._truth: Truth = hidden_truth(seed, concealed, shape, margins)
         self._radiometer_rng = np.random.default_rng([seed, 100])
         self._noise = {side: np.random.default_rng([seed, 101 + k]) for k, side in enumerate(SIDES)}
         self._camera_locks = {side: threading.Lock() for side in SIDES}
@@ -294,10 +297,11 @@ class Bench:
         return self.temperature_c + SELF_HEATING_C[side] + warmer
 
     def sensor(self, side: Side) -> tuple[int, int, float]:
-        """Return what a camera's own registers say of its sensor: rows, columns, distance of neighbouring pixels
-        (um)."""
-        model = self._truth.cameras[side].model
-        return model.rows, model.cols, model.pixel_pitch_um
+        """Return what a camera's own registers say of its sensor: rows and columns of a frame, distance of
+        neighbouring pixels (um)."""
+        camera = self._truth.cameras[side]
+        rows, cols = camera.margins.frame_shape(camera.model.rows, camera.model.cols)
+        return rows, cols, camera.model.pixel_pitch_um
 
     def compile_loops(self) -> None:
         """Those that patterns, charts, moved light and shot noise are drawn with: on a new installation that takes as
@@ -311,7 +315,7 @@ class Bench:
         displace_drawing(np.ones((2, 2)), np.zeros((4, 4)), np.zeros((4, 4)), 1)
 
     def expose(self, side: Side, exposure_s: float, gain_db: float = 0.0, start_s: float | None = None) -> UInt16Array:
-        """One raw frame, (rows, cols) DN, of what stands in front now.
+        """One raw frame, (rows, cols) DN with the margins, of what stands in front now.
 
         `start_s`: the virtual time at which it began (a pair triggered together shares it), None: now. Afterwards the
         clock stands at least at the exposure's end.
@@ -332,16 +336,18 @@ class Bench:
         )
         with self._camera_locks[side]:
             source *= unsteady_source(camera.model, camera.acting, exposure.elapsed_s)
-            held = collect_electrons(light, camera.model, exposure, camera.acting, source=source)
+            held = collect_electrons(
+                light, camera.model, exposure, camera.acting, source=source, margins=camera.margins
+            )
             read, self._kept[side] = read_electrons(held, camera.model, exposure, camera.acting, self._kept[side])
             frame = sample_from(
                 read,
                 camera.model,
                 self._noise[side],
                 camera.pattern,
-                dark_electrons=dark_electrons(camera.model, exposure, camera.acting),
+                dark_electrons=dark_electrons(camera.model, exposure, camera.acting, camera.margins),
                 gain_db=gain_db,
-                read_out=read_out(camera.model, exposure, camera.acting),
+                read_out=read_out(camera.model, exposure, camera.acting, camera.margins),
             )
         self.clock.sleep_until(begin_s + exposure_s)
         return frame

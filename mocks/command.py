@@ -313,6 +313,9 @@ def bench(
     warm_up: Annotated[
         float, typer.Option(help="degrees by which the sensors get warmer during the first virtual minutes")
     ] = 0.0,
+    margins: Annotated[
+        bool, typer.Option("--margins", help="frames hold masked pixels and overscan around the image, too")
+    ] = False,
 ) -> None:
     """Run the whole mock bench: prints one line an instrument, then `ready`.
 
@@ -324,7 +327,7 @@ def bench(
         stop = threading.Event()
         with _ended_by_signals(stop), contextlib.ExitStack() as running:
             line = _BenchLine(host, advertise or host, serial_over_tcp, display)
-            place = _bench(seed, real_time, concealed, warm_up)
+            place = _bench(seed, real_time, concealed, warm_up, with_margins=margins)
             addresses, known = _start_bench(running, stop, place, faults, line)
             for instrument, at in addresses.items():
                 _say(f"{instrument} {at['driver']} {at['address']}")
@@ -376,12 +379,15 @@ def _parse_concealed(specs: list[str], healthy: bool) -> Concealed | None:
         raise _Unusable(str(error)) from error
 
 
-def _bench(seed: int, real_time: float, concealed: Concealed | None, warm_up_c: float) -> Bench:
+def _bench(seed: int, real_time: float, concealed: Concealed | None, warm_up_c: float, *, with_margins: bool) -> Bench:
     from mocks.bench import Bench
+    from mocks.truth import MARGINS
+    from sim.sensor.margins import NO_MARGINS
 
     if not abs(warm_up_c) <= WARMEST_C:
         raise _Unusable(f"--warm-up {warm_up_c:g}: beyond {WARMEST_C:g} degrees; give how much warmer the sensors get")
-    place = Bench(seed, real_time, concealed, warm_up_c=warm_up_c, session_clock=time.time)
+    margins = MARGINS if with_margins else NO_MARGINS
+    place = Bench(seed, real_time, concealed, margins=margins, warm_up_c=warm_up_c, session_clock=time.time)
     place.compile_loops()
     return place
 

@@ -1,4 +1,4 @@
-"""What a bench may be told to conceal: effects of the library, with parameters, on one side or on both.
+"""What a bench may conceal: effects of the library, with parameters, on one side or on both.
 
     left:nonlinearity:quadratic_percent=2
     both:source_drift:drift_percent_per_min=0.5,settling_min=8

@@ -1,7 +1,7 @@
 """A Cornerstone 260B monochromator on USB: a USBTMC (USB488) device that takes SCPI-like commands.
 
 Each motion is done by a thread of its own: motions overlap, and commands don't wait for them; `*wai` and `*opc?` do. A
-host that asks where the grating stands without waiting is told where it stood. Wordings beyond those in the manual's
+host that asks where the grating stands without waiting reads where it stood. Wordings beyond those in the manual's
 examples follow SCPI-99.
 
 Source: USB-IF, USBTMC 1.0 and USB488; Newport, MCS260B manual, p. 43-46, 62.

@@ -27,7 +27,7 @@ _SPEEDS = ("slow", "normal", "fast", "2x fast")
 
 
 class ColorimetryResearch(Grammar):
-    """The instrument; `model` is "CR-300" or "CR-250", `step_nm` 2 or 4 if it isn't told."""
+    """The instrument; `model` is "CR-300" or "CR-250", `step_nm` 2 or 4, by default that of the model."""
 
     fault_code = TOO_LOW
 

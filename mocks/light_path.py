@@ -190,7 +190,7 @@ LEVEL_STEPS = 40
 
 
 def misread(camera: CameraModel, radiance: Spectrum, effects: Sequence[Effect], kind: str) -> Spectrum:
-    """Return what a radiometer with `effects` says of `radiance`: the reading from which the forward model gets that
+    """Return what a radiometer with `effects` reads of `radiance`: the reading from which the forward model gets that
     light.
 
     A scale that is shifted by d reads the light of w + d at w. One that isn't linear reads the shape at a level s that

@@ -575,15 +575,18 @@ def lit_bench() -> Bench:
 
 
 def cornerstone260() -> Peer:
+    """Return a mock of the Cornerstone 260 monochromator on a serial line."""
     return LinePeer(MockCornerstone260, light=Bench(), timeout_s=1.0, move_timeout_s=20.0)
 
 
 def cornerstone260b() -> Peer:
+    """Return a mock of the CS260B monochromator on USB."""
     bench = Bench()
     return UsbPeer((MockCornerstone260B(bench),), bench.clock, timeout_s=0.5, move_timeout_s=20.0)
 
 
 def cm110() -> Peer:
+    """Return a mock of the CM110 monochromator on a serial line."""
     return LinePeer(
         MockCm110,
         light=Bench(),
@@ -596,10 +599,12 @@ def cm110() -> Peer:
 
 
 def sp2150() -> Peer:
+    """Return a mock of the SP-2150 monochromator on a serial line."""
     return LinePeer(MockSp2150, light=Bench(), slit_um=500.0, dark_place=6, timeout_s=1.0, move_timeout_s=20.0)
 
 
 def specbos1211() -> Peer:
+    """Return a mock of the specbos 1211 spectroradiometer on a serial line."""
     return LinePeer(MockSpecbos1211, slowness=5.0, timeout_s=0.5, fetch_timeout_s=0.5, measure_timeout_s=2.0)
 
 
@@ -617,87 +622,107 @@ def spotread_command(address: str) -> str:
 
 
 def pr655() -> Peer:
+    """Return a mock of the PR-655 spectroradiometer on a serial line."""
     return LinePeer(PhotoResearch, slowness=3.0, timeout_s=0.5, measure_timeout_s=2.0)
 
 
 def cr300() -> Peer:
+    """Return a mock of the CR-300 spectroradiometer on a serial line."""
     return LinePeer(ColorimetryResearch, slowness=5.0, timeout_s=0.5, measure_timeout_s=2.0)
 
 
 def cs2000() -> Peer:
+    """Return a mock of the CS-2000 spectroradiometer on a serial line."""
     return LinePeer(MockCs2000, slowness=2.0, timeout_s=0.5, measure_timeout_s=5.0)
 
 
 def ocean_optics() -> Peer:
+    """Return a mock of the USB2000+ spectrometer on USB, before a lamp, with its calibration file."""
     lamp = Lamp(20.0, LampClock())
     peer = UsbPeer((MockUsb2000Plus(lamp),), lamp.clock, slowness=2.0, averages=2)
     return peer.with_file("calibration", spectrometer_calibration())
 
 
 def u3v() -> Peer:
+    """Return a mock of a USB3 Vision camera in white light."""
     bench = lit_bench()
     return UsbPeer(stereo_pair(bench)[:1], bench.clock, timeout_s=2.0)
 
 
 def basler() -> Peer:
+    """Return the camera that Basler's pylon emulates."""
     return EmulatedBasler()
 
 
 def gentl() -> Peer:
+    """Return the camera that GenICam's own GenTL producer simulates."""
     return VikyCamera()
 
 
 def aravis() -> Peer:
+    """Return the fake camera of Aravis."""
     return AravisFakeCamera()
 
 
 def alpaca() -> Peer:
+    """Return the camera of an Alpaca simulator."""
     return AlpacaSimulator()
 
 
 def indi() -> Peer:
+    """Return the camera of INDI's simulator."""
     return IndiSimulator()
 
 
 def gphoto2() -> Peer:
+    """Return the virtual camera of libgphoto2."""
     return VirtualCamera()
 
 
 def alpaca_lamp() -> Peer:
+    """Return the light source of an Alpaca simulator; it takes no pictures."""
     peer = AlpacaSimulator()
     peer.exposes = False
     return peer
 
 
 def indi_lamp() -> Peer:
+    """Return the light panel of INDI's simulator."""
     return IndiSimulator("Light Panel Simulator")
 
 
 def pe4000() -> Peer:
+    """Return a mock of the pE-4000 light source on a serial line."""
     return LinePeer(MockPe4000, slowness=0.0, timeout_s=0.5, load_timeout_s=10.0)
 
 
 def micromanager() -> Peer:
+    """Return the demo camera of Micro-Manager."""
     return DemoCamera()
 
 
 def raw_folder() -> Peer:
+    """Return a tethered camera that writes its raws into a folder."""
     return TetheredPeer()
 
 
 def operator_stage() -> Peer:
+    """Return a mock of the operator's stage on a TCP port."""
     return LinePeer(MockStage, tcp=True, timeout_s=1.0, place_timeout_s=5.0)
 
 
 def prompt_stage() -> Peer:
+    """Return a stage whose person confirms at once."""
     return PromptPeer()
 
 
 def browser_display() -> Peer:
+    """Return the display's page as a client without a browser asks for it."""
     return DisplayPeer()
 
 
 def scpi_photodiode() -> Peer:
+    """Return a mock of a SCPI photodiode meter on a TCP port, with its calibration file."""
     peer = LinePeer(
         MockScpiMeter,
         tcp=True,

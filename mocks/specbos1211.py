@@ -234,7 +234,7 @@ class MockSpecbos1211(Grammar):
         return ACK
 
     def _adapts(self) -> bool:
-        """Return whether it chooses its integration time: a spectraval does where it is told 0."""
+        """Return whether it chooses its integration time: a spectraval does where it is set to 0."""
         return self._settings["tint"] == 0 if self._is_spectraval else self._settings["expo"] == 1
 
     def _integration_ms(self) -> float:
@@ -271,7 +271,7 @@ class MockSpecbos1211(Grammar):
         return self._measured
 
     def _calculate_spectrum(self) -> bytes:
-        """Return a spectraval's: wavelength and value a line, if it was told to speak text.
+        """Return a spectraval's: wavelength and value a line, if it was set to text.
 
         Argyll's spotread takes 8000 bytes of 350..830 nm in steps of 1 nm, and asks again for what is longer.
         """

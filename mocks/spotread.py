@@ -148,7 +148,7 @@ class MockSpotread(Grammar):
             first_nm, last_nm, steps = HIGH if "-H" in self._options else USUAL
             value = 1e3 * radiance.at(np.linspace(first_nm, last_nm, steps))  # mW there
             text = f"\nSpectrum from {first_nm:.3f} to {last_nm:.3f} nm in {steps} steps\n"
-            text += ", ".join(f"{one:.6g}" for one in value)
+            text += ", ".join(f"{sample:.6g}" for sample in value)
             peak = int(np.argmax(value))
             text += f"\nPeak value {value[peak]:f} at (aprox.) {np.linspace(first_nm, last_nm, steps)[peak]:.1f} nm\n"
         result = "\n Result is XYZ: {:f} {:f} {:f}, D50 Lab: {:f} {:f} {:f}\n".format(*xyz, *_lab(xyz))

@@ -171,7 +171,13 @@ def _board_texture() -> FloatArray:
 
 
 def board_pose(name: str) -> Pose:
-    """Return where a ChArUco pose's board stands; its plane's origin is the board's centre."""
+    """Return where a ChArUco pose's board stands; its plane's origin is the board's centre.
+
+    name : of `BOARD_POSES`
+
+    >>> isinstance(board_pose(next(iter(BOARD_POSES))), Pose)
+    True
+    """
     (x, y, z), turns = BOARD_POSES[name]
     return Pose.of((float(x), float(y), DISTANCE_MM + z), turns)
 

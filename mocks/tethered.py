@@ -1,6 +1,6 @@
-"""A camera that its own software tethers: a thread that writes a DNG into a folder whenever it is told to shoot.
+"""A camera that its own software tethers: a thread that writes a DNG into a folder whenever a picture is asked for.
 
-Its "software" is told by two files in the folder: `.shoot` asks for a picture, `.exposure` holds the exposure time (s).
+Two files in the folder control its "software": `.shoot` asks for a picture, `.exposure` holds the exposure time (s).
 """
 
 from __future__ import annotations

@@ -28,6 +28,7 @@ from sim.effects.shutter_leakage import ShutterLeakage
 from sim.effects.source_drift import SETTLES_NEVER_MIN, SourceDrift
 from sim.optics.filters import SODIUM_NM
 from sim.sensor.electrons import FixedPattern
+from sim.sensor.margins import NO_MARGINS, Margins
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import ComplexArray, Image, Light, image_of
 
@@ -116,7 +117,7 @@ class HiddenCamera:
     """One camera: model and concealed effects, its pixels' pattern, where it stands, and what its maker says.
 
     A point X of the rig's frame (mm; origin amid the cameras, z forward) is `rotation` (X - `centre_mm`) in the
-    camera's."""
+    camera's. `pattern` is that of whole frames, `margins` around the active area included."""
 
     model: CameraModel
     effects: tuple[Effect, ...]
@@ -124,6 +125,7 @@ class HiddenCamera:
     rotation: FloatArray
     centre_mm: FloatArray
     datasheet: Mapping[str, Any]
+    margins: Margins = NO_MARGINS
 
     @property
     def geometry(self) -> Geometry:
@@ -151,7 +153,11 @@ class Truth:
 
 
 def makers_efficiency() -> dict[str, Spectrum]:
-    """Return the maker's QE curves (electrons a photon, 380..780 nm by 5), without infrared filter."""
+    """Return the maker's QE curves (electrons a photon, 380..780 nm by 5), without infrared filter.
+
+    >>> list(makers_efficiency())
+    ['R', 'G', 'B']
+    """
     w = np.arange(380.0, 780.1, 5.0)
     return {channel: Spectrum.of(w, np.round(curve, 4)) for channel, curve in _efficiency(w).items()}
 
@@ -204,8 +210,13 @@ def _shutter(effects: tuple[Effect, ...]) -> Shutter:
     return "global" if any(isinstance(effect, ShutterLeakage) for effect in effects) else "rolling"
 
 
-def _datasheet(shape: tuple[int, int], shutter: Shutter) -> dict[str, Any]:
-    return {
+#: Margins of a bench whose cameras have some: masked rows and columns, and overscan behind the last ones.
+MARGINS = Margins(masked_rows=(4, 0), masked_cols=(8, 0), overscan_rows=(0, 12), overscan_cols=(0, 16))
+
+
+def _datasheet(shape: tuple[int, int], shutter: Shutter, margins: Margins) -> dict[str, Any]:
+    stated = {} if margins == NO_MARGINS else {"margins": margins.model_dump(exclude_defaults=True)}
+    return stated | {
         "rows": shape[0],
         "cols": shape[1],
         "pixel_pitch_um": PITCH_UM,
@@ -249,9 +260,14 @@ _UNITS: dict[Side, dict[str, float]] = {
 
 
 def _camera(
-    side: Side, rng: np.random.Generator, effects: tuple[Effect, ...], shape: tuple[int, int], plain: bool
+    side: Side,
+    rng: np.random.Generator,
+    effects: tuple[Effect, ...],
+    shape: tuple[int, int],
+    plain: bool,
+    margins: Margins,
 ) -> HiddenCamera:
-    sheet = _datasheet(shape, _shutter(effects))
+    sheet = _datasheet(shape, _shutter(effects), margins)
     rows, cols = shape
     unit = _UNITS[side]
     vary = rng.uniform(0.99, 1.01, 6)
@@ -293,10 +309,11 @@ def _camera(
     return HiddenCamera(
         model=model,
         effects=effects,
-        pattern=_pattern(rng, shape, model.prnu_percent, model.dsnu_e, white=plain),
+        pattern=_pattern(rng, shape, model.prnu_percent, model.dsnu_e, white=plain).surrounded(margins),
         rotation=turn.as_matrix(),
         centre_mm=np.array([outwards * BASELINE_MM / 2, 0.0, 0.0]) + rng.uniform(-0.3, 0.3, 3),
         datasheet=sheet,
+        margins=margins,
     )
 
 
@@ -310,10 +327,15 @@ CONCEALED: Concealed = {
 }
 
 
-def hidden_truth(seed: int = 1, concealed: Concealed | None = None, shape: tuple[int, int] = (ROWS, COLS)) -> Truth:
+def hidden_truth(
+    seed: int = 1,
+    concealed: Concealed | None = None,
+    shape: tuple[int, int] = (ROWS, COLS),
+    margins: Margins = NO_MARGINS,
+) -> Truth:
     """Return the truth of a seed. `concealed` None: `CONCEALED`, and structure in the pixels' patterns; else that
-    alone, in cameras that are otherwise the same. `shape`: rows and columns of the frames; the same lens before a
-    smaller sensor sees less.
+    alone, in cameras that are otherwise the same. `shape`: rows and columns that see light; the same lens before a
+    smaller sensor sees less. `margins`: around these in each frame.
 
     Raises `mocks.conceal.ConcealError` for what the bench can't show.
     """
@@ -327,6 +349,7 @@ def hidden_truth(seed: int = 1, concealed: Concealed | None = None, shape: tuple
                 tuple(map(_finer, effects.get(side, ()))),
                 shape,
                 concealed is not None,
+                margins,
             )
             for index, side in enumerate(SIDES)
         }

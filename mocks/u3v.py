@@ -1,7 +1,7 @@
 """A USB3 Vision camera as a USB device: GenCP control, registers, zipped GenICam XML, and the stream.
 
 Everything a driver can learn stands in registers that a real camera has; light comes from the bench through one call,
-`Bench.expose`. The registers' layout is this maker's own affair and is told by the XML alone.
+`Bench.expose`. The registers' layout is this maker's own and stands in the XML alone.
 
 Source: EMVA GenCP 1.2; A3 USB3 Vision 1.1; EMVA SFNC 2.7 for the features' names, PFNC for the pixel formats.
 """
@@ -147,7 +147,7 @@ def _float_bits(value: float) -> int:
 
 
 class TriggerLine:
-    """The wire that runs from each camera's Line1 to the others' Line0; a pulse goes out where Line1 is told to follow
+    """The wire that runs from each camera's Line1 to the others' Line0; a pulse goes out where Line1 is set to follow
     the exposure."""
 
     def __init__(self) -> None:

@@ -61,8 +61,15 @@ def devices(name: str, bench: BeforeCameras | MeasuredLight | None = None) -> tu
 
 
 def backend(name: str, bench: Bench | None = None) -> InProcessBackend:
-    """Return a pyusb backend with that instrument plugged in (`u3v`, `u3v-stereo`, `cornerstone260b`, `usb2000plus`);
-    `.plugged_in` are its device models."""
+    """Return a pyusb backend with an instrument plugged in; `.plugged_in` are its device models.
+
+    name : `u3v`, `u3v-stereo`, `cornerstone260b` or `usb2000plus`
+    bench : the light path that it stands on; by default a new one
+
+    >>> import usb.core
+    >>> usb.core.find(backend=backend("usb2000plus")).idVendor == 0x2457
+    True
+    """
     return InProcessBackend(devices(name, bench))
 
 

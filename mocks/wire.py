@@ -423,8 +423,9 @@ def serve(
     faults: Iterable[Fault] = (),
     announce: Callable[[str], None] = lambda address: None,
 ) -> None:
-    """Serve a grammar on an endpoint until `stop` is set; `announce` is told the address each time it can be opened. A
-    `FaultyLine` has faults of its own."""
+    """Serve a grammar on an endpoint until `stop` is set; `announce` is called with the address each time it can be
+    opened. A `FaultyLine` has faults of its own.
+    """
     line = grammar if isinstance(grammar, FaultyLine) else FaultyLine(grammar, faults)
     grammar = line.grammar
     held: deque[tuple[float, Output]] = deque()

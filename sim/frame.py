@@ -10,7 +10,7 @@ baseline bit for bit.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,9 +27,10 @@ from sim.plain_image import plain_images
 from sim.scene.scenes import Darkness, Scene, SpectralImage
 from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
-from sim.sensor.electrons import FixedPattern, ReadOut
+from sim.sensor.electrons import Amplifiers, FixedPattern, ReadOut
+from sim.sensor.margins import NO_MARGINS, Margins
 from sim.spectrum import FloatArray, Spectrum
-from sim.stages import Image, charge_of, codes_of, image_of, laws_of, light_of, signal_of
+from sim.stages import Image, PatternNoise, charge_of, codes_of, image_of, laws_of, light_of, signal_of
 from sim.traced_image import traced_image
 from sim.uniform import Uniform
 
@@ -64,6 +65,7 @@ def expected_electrons(
     oversample: int = 3,
     margin_px: int = 32,
     source: float = 1.0,
+    margins: Margins = NO_MARGINS,
 ) -> FloatArray:
     """Mean electrons (rows, cols) of every pixel, light and dark current, after the effects on charge; not yet clipped.
 
@@ -74,13 +76,14 @@ def expected_electrons(
     0.6, 0.2, 0.1, 0.05 % of white rms; a frame of 480 x 640 takes 0.5, 1.1, 2.4 s of one core at 2, 3, 4. Cells of a
     whole number of pixels whose borders are the pixels' alias alike all over the frame: at s samples a pixel an
     amplitude at f cy/px is drawn too high by (pi f / s)^2 / 3 along each axis, 3 % at 0.3 cy/px and 3 samples.
-    `source`: factor on the scene's light, such as `unsteady_source` of the frame that is drawn.
+    `source`: factor on the scene's light, such as `unsteady_source` of the frame that is drawn. `margins`: around the
+    active area in the frame that is returned.
     """
     check_overlap(camera, exposure.scene)
     light = scene_light(
         camera, exposure.scene, effects, oversample=oversample, margin_px=margin_px, placed=exposure.placed
     )
-    return collect_electrons(light, camera, exposure, effects, source=source)
+    return collect_electrons(light, camera, exposure, effects, source=source, margins=margins)
 
 
 def unsteady_source(camera: CameraModel, effects: Sequence[Effect], elapsed_s: float) -> float:
@@ -134,11 +137,17 @@ def scene_light(
 
 
 def collect_electrons(
-    light: SceneLight, camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, source: float = 1.0
+    light: SceneLight,
+    camera: CameraModel,
+    exposure: Exposure,
+    effects: Sequence[Effect] = (),
+    *,
+    source: float = 1.0,
+    margins: Margins = NO_MARGINS,
 ) -> FloatArray:
     """`expected_electrons` of a scene whose light is known. `source`: factor on the scene's light at this time, beside
     the effects'. Light of the room is collected as long as the source's: for the time that the shutter is really
-    open.
+    open. `margins`: of the frame that is returned; neighbours and full wells act within the active area alone.
     """
     before_lens, charge = light_of(camera, effects), charge_of(camera, effects)
     source *= before_lens.source(exposure.elapsed_s)
@@ -160,7 +169,10 @@ def collect_electrons(
     down, across = np.linspace(0.0, 1.0, camera.rows)[:, None], np.linspace(0.0, 1.0, camera.cols)[None, :]
     mean *= charge.collected_s(exposure.exposure_s) + charge.leaked_s(down, across)
     np.add(charge.collect_light(charge.stray_pixels(mean)), dark_electrons(camera, exposure, effects), out=mean)
-    return charge.clock_out(charge.overflow_wells(charge.move_charge(mean)))
+    held = charge.overflow_wells(charge.move_charge(mean))
+    if margins != NO_MARGINS:
+        held = margins.surround(held, masked=_even_dark_electrons(camera, exposure, effects))
+    return charge.clock_out(held, margins)
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,12 +325,25 @@ def check_not_saturated(camera: CameraModel, exposure: Exposure, electrons: Floa
         )
 
 
-def dark_electrons(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = ()) -> FloatArray | float:
-    """Mean electrons of the dark current in one exposure, at its temperature; (rows, cols) where effects tell pixels
-    apart.
+def dark_electrons(
+    camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), margins: Margins = NO_MARGINS
+) -> FloatArray | float:
+    """Mean electrons of the dark current in one exposure, at its temperature; (rows, cols) where effects, or `margins`,
+    tell pixels apart.
     """
     rate: FloatArray | float = sensor.dark_current_e_per_s(camera, exposure.temperature_c)
-    return charge_of(camera, effects).dark_e_per_s(rate, exposure.temperature_c) * exposure.exposure_s
+    found = charge_of(camera, effects).dark_e_per_s(rate, exposure.temperature_c) * exposure.exposure_s
+    if margins == NO_MARGINS:
+        return found
+    active: FloatArray = np.broadcast_to(found, (camera.rows, camera.cols))
+    return margins.surround(active, masked=_even_dark_electrons(camera, exposure, effects))
+
+
+def _even_dark_electrons(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect]) -> float:
+    """Return the mean electrons of the dark current of a masked pixel: the median of those that aren't defective."""
+    rate: FloatArray | float = sensor.dark_current_e_per_s(camera, exposure.temperature_c)
+    even = charge_of(camera, effects).even_dark_e_per_s(rate, exposure.temperature_c)
+    return float(np.median(even)) * exposure.exposure_s
 
 
 def moments(
@@ -354,8 +379,10 @@ def sample(
     *,
     oversample: int = 3,
     margin_px: int = 32,
+    margins: Margins = NO_MARGINS,
 ) -> NDArray[np.uint16]:
-    """One raw frame (rows, cols) drawn from the model. `fixed_pattern` None: pixels that are all alike.
+    """One raw frame (rows, cols) drawn from the model. `fixed_pattern` None: pixels that are all alike. `margins`: of
+    the frame, and of the fixed pattern.
 
     For many frames of one scene take `expected_electrons` once and draw with `sim.sensor.electrons.sample_from`.
     """
@@ -367,13 +394,14 @@ def sample(
             oversample=oversample,
             margin_px=margin_px,
             source=unsteady_source(camera, effects, exposure.elapsed_s),
+            margins=margins,
         ),
         camera,
         rng,
         fixed_pattern,
-        dark_electrons=dark_electrons(camera, exposure, effects),
+        dark_electrons=dark_electrons(camera, exposure, effects, margins),
         gain_db=exposure.gain_db,
-        read_out=read_out(camera, exposure, effects),
+        read_out=read_out(camera, exposure, effects, margins),
     )
 
 
@@ -435,8 +463,34 @@ def sample_sequence(
         )
 
 
-def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect]) -> ReadOut:
-    """Collect the effects' laws of read-out and converter: responses, noise and offsets, one after the other."""
+@dataclass(frozen=True)
+class _CoupledWithin:
+    """Amplifiers that couple the active areas of frames with margins."""
+
+    within: Amplifiers
+    margins: Margins
+
+    def _inside(self, law: Callable[[FloatArray], FloatArray], frame: FloatArray) -> FloatArray:
+        out = np.array(frame)
+        self.margins.active(out)[...] = law(self.margins.active(frame))
+        return out
+
+    def couple(self, electrons: FloatArray) -> FloatArray:
+        return self._inside(self.within.couple, electrons)
+
+    def couple_variances(self, variance_e2: FloatArray) -> FloatArray:
+        return self._inside(self.within.couple_variances, variance_e2)
+
+    def couple_noise(self, noise_e: FloatArray) -> FloatArray:
+        return self._inside(self.within.couple_noise, noise_e)
+
+
+def read_out(
+    camera: CameraModel, exposure: Exposure, effects: Sequence[Effect], margins: Margins = NO_MARGINS
+) -> ReadOut:
+    """Collect the effects' laws of read-out and converter: responses, noise and offsets, one after the other.
+    `margins`: of the frames that are read. Areas and patterns of the sensor stay those of its active area, and so do
+    the moments of what is added."""
     if not effects:
         return sensor.LINEAR
     charge, signal, codes = charge_of(camera, effects), signal_of(camera, effects), codes_of(camera, effects)
@@ -444,11 +498,16 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
     disturbances = (*signal.random_at(exposure.elapsed_s), *particles)
 
     def draw_disturbances(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
-        return sum((disturbance.draw(shape, rng) for disturbance in disturbances), np.zeros((1, 1)))
+        return sum((disturbance.draw(shape, rng) for disturbance in of_frame), np.zeros((1, 1)))
 
     # Only where there is a law something acts, so that effects elsewhere leave the read-out the baseline's to the last
     # bit.
     shape = camera.rows, camera.cols
+    of_frame = [
+        disturbance.surrounded(margins, shape) if isinstance(disturbance, PatternNoise) else disturbance
+        for disturbance in disturbances
+    ]
+    gain, amplifiers = signal.gain_map(shape), signal if signal.amplifiers else None
     return ReadOut(
         signal.read if signal.response else None,
         charge.shot_e2 if charge.variance_e2 else None,
@@ -459,10 +518,10 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         codes.convert if codes.codes else None,
         charge.neighbour_correlation if charge.correlation else None,
         signal.filter_kernel(),
-        signal.gain_map(shape),
+        gain if gain is None or margins == NO_MARGINS else margins.surround(gain, 1.0, 1.0),
         signal.read_kernel(),
         charge.multiplication(exposure.gain_db),
-        signal if signal.amplifiers else None,
+        amplifiers if amplifiers is None or margins == NO_MARGINS else _CoupledWithin(amplifiers, margins),
     )
 
 

@@ -32,6 +32,7 @@ from sim.sensor.amplifiers import CoupledAmplifiers
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.electrons import NEIGHBOURS, NO_MULTIPLICATION, Multiplication
 from sim.sensor.lines import LineGains, LineNoise
+from sim.sensor.margins import NO_MARGINS, Margins
 from sim.sensor.particles import Particles
 from sim.sensor.reading_order import ReadOutNoise
 from sim.sensor.trails import Trails, read_combs
@@ -487,9 +488,24 @@ class Charge(State):
         """Mean electrons of a whole frame after what is above the full well has run over."""
         return reduce(lambda value, law: law(value), self.overflow, electrons)
 
-    def clock_out(self, electrons: FloatArray) -> FloatArray:
-        """Mean electrons of a whole frame (rows, cols) as they arrive at the output: rows first, then columns."""
-        return reduce(lambda value, law: law.clock(value), self.trails, electrons)
+    def clock_out(self, electrons: FloatArray, margins: Margins = NO_MARGINS) -> FloatArray:
+        """Mean electrons of a whole frame (rows, cols) as they arrive at the output: rows first, then columns.
+        `margins`: of the frame. A packet leaves no more behind than one of a full well does, and five standard
+        deviations of its shot noise, above which pixels stay saturated."""
+        if not self.trails:
+            return electrons
+        full_e = self.camera.full_well_e
+        held = np.minimum(electrons, full_e + 5.0 * math.sqrt(full_e))
+        return reduce(lambda value, law: law.clock(value, margins.lines[law.axis]), self.trails, held)
+
+    def clock_profile(self, axis: Literal[0, 1], profile: FloatArray, margins: Margins) -> FloatArray:
+        """Return the means of all lines of a frame along an axis, margins included, given those of the active lines
+        (n,), none elsewhere. Each law is linear in the packets, and so in their means."""
+        lines = margins.lines[axis]
+        laws = (replace(law, axis=0) for law in self.trails if law.axis == axis)
+        return np.asarray(
+            reduce(lambda value, law: law.clock(value, lines), laws, np.pad(profile, lines)[:, None])[:, 0]
+        )
 
     def _transfers(self, place_um: tuple[float, float]) -> list[float]:
         """How often a packet of a place is transferred by each of `trails`."""
@@ -560,6 +576,10 @@ class PatternNoise:
 
     offset_e: FloatArray | float
     added_e2: FloatArray | float
+
+    def surrounded(self, margins: Margins, shape: tuple[int, int]) -> PatternNoise:
+        """Return it in frames with margins around an active area of that shape: these have neither."""
+        return PatternNoise(margins.embed(self.offset_e, *shape), margins.embed(self.added_e2, *shape))
 
     def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         """Draw the offsets of one frame, in electrons."""

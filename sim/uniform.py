@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial, reduce
+from typing import Literal
 
 import numpy as np
 from scipy.special import ndtri
@@ -18,6 +19,7 @@ from sim.sensor import mosaic
 from sim.sensor.amplifiers import CoupledAmplifiers
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.lines import LineGains, LineNoise, Lines
+from sim.sensor.margins import Margins
 from sim.sensor.particles import Particles
 from sim.sensor.reading_order import ReadOutNoise
 from sim.spectrum import FloatArray, Spectrum
@@ -372,6 +374,11 @@ class Uniform:
     def trails(self) -> bool:
         """Return whether packets leave charge behind on their way to the output."""
         return bool(self._charge.trails)
+
+    def clock_profile(self, axis: Literal[0, 1], profile: FloatArray, margins: Margins) -> FloatArray:
+        """Return the means of all lines of a frame along an axis, 0 of rows, 1 of columns, with its margins, as they
+        are read, given those of the active lines (n,)."""
+        return self._charge.clock_profile(axis, profile, margins)
 
     def exchanged_e(self, squares: FloatArray) -> FloatArray:
         """Change (n,) of the middle pixels' electrons by charge that unequal neighbours exchange. `squares`: (n, k, k)

@@ -26,7 +26,7 @@ from lab.report.certificate import Certificate, certificate, certificate_page, r
 router = APIRouter(tags=["calibrations"])
 
 
-def _known(service: Service, calibration_id: str) -> CalibrationRecord:
+def _find_calibration(service: Service, calibration_id: str) -> CalibrationRecord:
     missing = f"no calibration {calibration_id!r}; GET /api/v1/calibrations lists them"
     return find_or_404(missing, lambda: life.calibration(service.store, calibration_id))
 
@@ -47,15 +47,15 @@ def list_calibrations(
 def get_calibration(service: Here, calibration_id: HexId) -> CalibrationDetail:
     """One calibration. `judgements` of a candidate are by the limits of the data folder (`limits.toml`), where it has
     some; those of another are as it was certified. `warnings`: what its session's newest diagnosis says against it."""
-    judged = judged_calibration(service, calibration_id)
+    judged = judge_calibration(service, calibration_id)
     return CalibrationDetail(
         **dict(judged), warnings=rejections(service.store, judged), has_cameras=_has_cameras(service, judged.id)
     )
 
 
-def judged_calibration(service: Service, calibration_id: str) -> CalibrationRecord:
+def judge_calibration(service: Service, calibration_id: str) -> CalibrationRecord:
     """A calibration; a candidate by the limits of the data folder. 404 where there is none."""
-    calibration = _known(service, calibration_id)
+    calibration = _find_calibration(service, calibration_id)
     standing = standing_limits(service.store.root) if calibration.limits is None else None
     if standing is None:
         return calibration
@@ -107,7 +107,7 @@ def _newest_figures(service: Service, source: str, what: str) -> list[FigureOfFi
 @router.get("/calibrations/{calibration_id}/figures", dependencies=[READ], responses=answers(401, 404, 422))
 def calibration_figures(service: Here, calibration_id: HexId) -> list[FigureOfFit]:
     """Every number of a calibration that has an uncertainty, by the data folder's limits where one concerns it."""
-    return _figures_of_fit(service, life.figures(service.store, _known(service, calibration_id).id))
+    return _figures_of_fit(service, life.figures(service.store, _find_calibration(service, calibration_id).id))
 
 
 @router.get("/sessions/{session_id}/figures", dependencies=[READ], responses=answers(401, 404, 409, 422))
@@ -127,7 +127,7 @@ def recordings_figures(service: Here, recordings_id: HexId) -> list[FigureOfFit]
 def drafted_limits(service: Here, calibration_id: HexId) -> DraftedLimits:
     """Limits drafted from what the same cameras had before: where the next calibration of an unchanged camera lies with
     99 %. They say what is usual; what a camera has to reach, somebody decides. Nothing is kept."""
-    wanted = _known(service, calibration_id).id
+    wanted = _find_calibration(service, calibration_id).id
     drafts, whence = life.draft_limits(service.store, wanted)
     words = f"Drafted from {len(whence)} earlier calibrations of these cameras: what is usual for them."
     if wanted in whence:
@@ -161,7 +161,7 @@ def certify_calibration(
     """Certify a candidate against limits, by the holder of the key; what the same cameras had before is superseded.
     422, with a reason for each, where figures are bad or missing, or in the warning band and that isn't accepted; 409
     for what is no candidate."""
-    calibration = _known(service, calibration_id)
+    calibration = _find_calibration(service, calibration_id)
     if calibration.state != "candidate":
         raise Conflict(f"calibration {calibration_id} is {calibration.state}; only a candidate can be certified")
     limits = asked.stated() or standing_limits(service.store.root)
@@ -171,7 +171,7 @@ def certify_calibration(
 
 
 def _find_certified(service: Service, calibration_id: str) -> CalibrationRecord:
-    calibration = _known(service, calibration_id)
+    calibration = _find_calibration(service, calibration_id)
     if calibration.certified is None:
         raise Conflict(f"calibration {calibration_id} is a {calibration.state}; certify it, then it has a certificate")
     return calibration
@@ -211,7 +211,7 @@ def revoke_calibration(
     key: Annotated[StoredKey, Depends(Demand(Permission.CALIBRATE))],
 ) -> CalibrationRecord:
     """Take a certificate back, with the reason, by the holder of the key. 409 for a calibration without one."""
-    calibration = _known(service, calibration_id)
+    calibration = _find_calibration(service, calibration_id)
     try:
         return life.revoke(service.store, calibration.id, key.name, asked.why)
     except InputError as error:

@@ -13,7 +13,7 @@ from fastapi import APIRouter, Depends, HTTPException, Request, Response
 from api.errors import Conflict, answers
 from api.keys import StoredKey
 from api.routes.sessions import check_then, register_session, stored_session
-from api.safety import StationSafety, key_of
+from api.safety import StationSafety, shutter_key
 from api.schemas import Halt, Halted, HaltedStation, QueueEntry, QueuePlace, SessionStart, StoredSession
 from api.security import DemandHalt
 from api.service import OPERATE, OVER, READ, ROOM, Here, Service, SessionId
@@ -167,14 +167,14 @@ def halt(
     busy: dict[str, Station] = {}
     for id in ended:
         if (session := live.find(id)) is not None:
-            busy[key_of(session.station)] = session.station
-            if key_of(session.station) not in {
-                key_of(station) for station in stations.values()
+            busy[shutter_key(session.station)] = session.station
+            if shutter_key(session.station) not in {
+                shutter_key(station) for station in stations.values()
             }:  # it has no file any more
                 stations[f"session {id}"] = session.station
     answering = list(ended.values())
-    for idle_station in {key_of(station): station for station in stations.values()}.values():
-        if key_of(idle_station) not in busy:
+    for idle_station in {shutter_key(station): station for station in stations.values()}.values():
+        if shutter_key(idle_station) not in busy:
             answering.append(live.make_safe(idle_station))
     wait([held], max(0.0, until_s - time.monotonic()))
     later = live.halt(station, why)  # what the queue began in between

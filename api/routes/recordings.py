@@ -148,7 +148,7 @@ def _capture(recordings_id: str, number: int, capture: Capture) -> RecordedCaptu
     )
 
 
-def _known_capture(service: Service, recordings_id: str, number: int) -> Capture:
+def _find_capture(service: Service, recordings_id: str, number: int) -> Capture:
     service.recordings(recordings_id)
     captures = service.pictures.recordings(recordings_id).captures()
     if number > len(captures):
@@ -202,7 +202,7 @@ def list_recorded_captures(
 )
 def get_recorded_capture(service: Here, recordings_id: HexId, number: RegistryId) -> RecordedCapture:
     """One capture of a recording set."""
-    return _capture(recordings_id, number, _known_capture(service, recordings_id, number))
+    return _capture(recordings_id, number, _find_capture(service, recordings_id, number))
 
 
 @router.get(
@@ -222,7 +222,7 @@ def preview_recorded_capture(
     stretch: Stretch = False,
 ) -> Response:
     """A small picture, as of a session's capture."""
-    _known_capture(service, recordings_id, number)
+    _find_capture(service, recordings_id, number)
     return picture_of(service, request, recordings_id, number, picture, width, stretch)
 
 
@@ -235,7 +235,7 @@ def preview_recorded_capture(
 )
 def recorded_frame(service: Here, recordings_id: HexId, number: RegistryId) -> Response:
     """The raw frame as .npy: uint16 (rows, cols)."""
-    _known_capture(service, recordings_id, number)
+    _find_capture(service, recordings_id, number)
     return npy_of(service, recordings_id, number)
 
 
@@ -247,7 +247,7 @@ def recorded_frame(service: Here, recordings_id: HexId, number: RegistryId) -> R
 )
 def recorded_figures(service: Here, recordings_id: HexId, number: RegistryId, response: Response) -> FrameFigures:
     """Histogram, mean and share of saturated pixels of each channel of the frame."""
-    _known_capture(service, recordings_id, number)
+    _find_capture(service, recordings_id, number)
     response.headers.update(FOR_EVER)
     return service.pictures.figures(recordings_id, number)
 

@@ -370,7 +370,7 @@ def _capture(info: CaptureInfo) -> StoredCapture:
     )
 
 
-def _known_capture(service: Service, session_id: str, capture_id: int) -> CaptureInfo:
+def _find_capture(service: Service, session_id: str, capture_id: int) -> CaptureInfo:
     missing = f"no capture {capture_id} in session {session_id[:60]!r}; GET /api/v1/sessions/ID/captures lists them"
     info = find_or_404(missing, lambda: service.store.capture(capture_id))
     if info.session_id != session_id:
@@ -426,7 +426,7 @@ def list_captures(
 )
 def get_capture(service: Here, session_id: SessionId, capture_id: RegistryId) -> StoredCapture:
     """One capture."""
-    return _capture(_known_capture(service, session_id, capture_id))
+    return _capture(_find_capture(service, session_id, capture_id))
 
 
 @router.get(
@@ -447,7 +447,7 @@ def preview_capture(
 ) -> Response:
     """A small picture, .png or .webp (a tenth of its bytes): black subtracted, one value per colour and mosaic cell,
     gamma-encoded, without white balance."""
-    info = _known_capture(service, session_id, capture_id)
+    info = _find_capture(service, session_id, capture_id)
     return picture_of(service, request, session_id, info.id, picture, width, stretch)
 
 
@@ -460,7 +460,7 @@ def preview_capture(
 )
 def capture_frame(service: Here, session_id: SessionId, capture_id: RegistryId) -> Response:
     """The raw frame as .npy: uint16 (rows, cols), checked against its SHA-256."""
-    info = _known_capture(service, session_id, capture_id)
+    info = _find_capture(service, session_id, capture_id)
     return npy_of(service, session_id, info.id)
 
 
@@ -472,7 +472,7 @@ def capture_frame(service: Here, session_id: SessionId, capture_id: RegistryId) 
 )
 def capture_figures(service: Here, session_id: SessionId, capture_id: RegistryId, response: Response) -> FrameFigures:
     """Histogram, mean and share of saturated pixels of each channel of the frame."""
-    info = _known_capture(service, session_id, capture_id)
+    info = _find_capture(service, session_id, capture_id)
     response.headers.update(FOR_EVER)
     return service.pictures.figures(session_id, info.id)
 

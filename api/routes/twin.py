@@ -68,7 +68,7 @@ def _folder(service: Service) -> Path:
     return service.store.root / "predictions"
 
 
-def _sealed(service: Service, prediction_id: str) -> SealedPrediction:
+def _open_prediction(service: Service, prediction_id: str) -> SealedPrediction:
     """A prediction whose seal holds; 404 where there is none. Raises InputError where it was edited."""
     file = _folder(service) / f"{prediction_id}.json"
     if not file.is_file():
@@ -139,7 +139,7 @@ def list_predictions(
 @router.get("/predictions/{prediction_id}", dependencies=[READ], responses=answers(401, 404, 422))
 def get_prediction(service: Here, prediction_id: HexId) -> StoredPrediction:
     """One prediction: of which model, with which changes, and its hash. 422 where the file was edited."""
-    return _fields(service, prediction_id, _sealed(service, prediction_id))
+    return _fields(service, prediction_id, _open_prediction(service, prediction_id))
 
 
 @router.get(
@@ -150,7 +150,7 @@ def get_prediction(service: Here, prediction_id: HexId) -> StoredPrediction:
 )
 def sealed_prediction(service: Here, prediction_id: HexId) -> FileResponse:
     """The sealed file, byte by byte: its SHA-256 is `sha256` of the prediction."""
-    _sealed(service, prediction_id)
+    _open_prediction(service, prediction_id)
     return FileResponse(_folder(service) / f"{prediction_id}.json", media_type="application/json")
 
 
@@ -171,7 +171,7 @@ def delete_prediction(service: Here, prediction_id: HexId) -> None:
 def score_prediction(service: Here, prediction_id: HexId, asked: SetAsked) -> TwinScore:
     """Open a prediction against the session that it foretold: deviations, intervals, and names that don't survive, as
     `calibench twin score` tells them. 422 where it was edited, and for another session."""
-    sealed = _sealed(service, prediction_id)
+    sealed = _open_prediction(service, prediction_id)
     id, kept = _set(service, asked)
     recordings = _read(kept)
     with _one_at_a_time():

@@ -211,7 +211,11 @@ RECORDED = (
 
 def set_if_there(features: Features, name: str, value: Setting) -> None:
     """Set a feature that the camera has, an enumeration's entry that it offers; some can't be written, and have the
-    value already."""
+    value already.
+
+    features : of the camera
+    name, value : of the feature
+    """
     if not features.has(name) or (isinstance(value, str) and value not in features.entries(name)):
         return
     try:
@@ -337,8 +341,20 @@ def black_level(features: Features) -> float | None:
 
 
 def trigger_line(features: Features, who: str, wanted: str | None) -> str:
-    """Return the line that triggers exposures: `wanted`, else Line0. Raises `InstrumentError` that names those the
-    camera has."""
+    """Return the input line that triggers exposures. Nothing is set.
+
+    features : of the camera
+    who : beginning of the message
+    wanted : name of the line of the station file; by default Line0
+
+    Raises `InstrumentError` that names the lines that the camera has.
+
+    >>> class Camera:
+    ...     def entries(self, name):
+    ...         return ["Software", "Line0", "Line2"]
+    >>> trigger_line(Camera(), "camera", None), trigger_line(Camera(), "camera", "Line2")
+    ('Line0', 'Line2')
+    """
     lines = [name for name in features.entries("TriggerSource") if name.startswith("Line")]
     name = wanted or "Line0"
     if name in lines:

@@ -66,7 +66,7 @@ class _Producer:
 
     @contextmanager
     def _open(self) -> Iterator[list[Any]]:
-        """What it says of its cameras. Raises `InstrumentError` for a file that is none."""
+        """Open a producer. Raises `InstrumentError` for a file that is none."""
         with self._lock:
             if self._harvester is None:
                 core = _library()
@@ -314,7 +314,7 @@ class GentlCamera(GenicamCamera):
 
 
 def _read_info(of: Any, name: str) -> Any:
-    """Return what a producer says of a camera or a buffer; None where it doesn't."""
+    """Return what a producer states of a camera or a buffer; None where it doesn't."""
     from genicam import gentl
 
     try:

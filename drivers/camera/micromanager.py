@@ -140,7 +140,7 @@ class Core:
     def expose(self) -> None:
         """Begin one exposure; the core opens and closes the shutter where that is automatic.
 
-        The core allocates its buffer with the first one: 250 MB unless told otherwise, which takes a busy computer
+        The core allocates its buffer with the first one: 250 MB by default, which takes a busy computer
         seconds. Two pictures are enough.
         """
         buffer_mb = 1 + 2 * self._core.getImageBufferSize() // 2**20

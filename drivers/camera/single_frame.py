@@ -256,7 +256,7 @@ class SingleFrameCamera(Camera):
             return self._settings()
 
     def _settings(self) -> dict[str, Setting]:
-        """All that it tells of itself, by name."""
+        """Return all that it reports of itself, by name."""
         return {}
 
     def stop(self) -> None:

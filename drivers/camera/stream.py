@@ -63,8 +63,8 @@ class FrameStream:
     The cameras are configured and stay armed. `interval_s`: least time from one trigger to the next. `in_flight`:
     triggers that are given before the frames of the first of them are there, which needs an interval that the cameras
     keep up with; the first of a series is always given alone, as it sets the clocks against one another. `on_loss` is
-    told of everything that got lost, in one line each. The next trigger is given before a pair is handed out: while a
-    pair is kept, the next one is exposed.
+    notified of everything that got lost, in one line each. The next trigger is given before a pair is handed out: while
+    a pair is kept, the next one is exposed.
 
     Raises ValueError for several triggers in flight without an interval.
     """
@@ -174,7 +174,7 @@ class FrameStream:
     # --- frames -----------------------------------------------------------------------------------------------------
 
     def _pair(self) -> tuple[Frame, ...] | None:
-        """Return the frames of the oldest trigger that isn't settled; None if one of them got lost."""
+        """Return the frames of the oldest trigger that is still open; None if one of them got lost."""
         for side in self._sides:
             while side.trigger < self._settled:
                 self._receive(side)
@@ -226,7 +226,7 @@ class FrameStream:
         self._lose(why)
 
     def _settle(self, trigger: int) -> None:
-        """All triggers before this one are settled, with a pair or without."""
+        """Close all triggers before this one, with a pair or without."""
         while self._settled < trigger:
             self._settled += 1
             self._given.popleft()

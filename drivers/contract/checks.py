@@ -97,11 +97,11 @@ def _safe_state(subject: _Subject) -> None:
     with subject.make() as driver:
         subject.contract.everyday(driver)
         driver.stop()
-        subject.contract.is_safe(driver)
+        subject.contract.require_safe(driver)
         driver.stop()
         subject.contract.everyday(driver)
     with subject.make() as driver:
-        subject.contract.is_safe(driver)
+        subject.contract.require_safe(driver)
 
 
 def _time_out(subject: _Subject) -> None:
@@ -145,7 +145,7 @@ def _stop(subject: _Subject) -> None:
             _stop_in_the_middle(subject, driver)
         finally:
             subject.peer.slow(False)
-        _works_again(lambda: subject.contract.is_safe(driver), "it was stopped")
+        _works_again(lambda: subject.contract.require_safe(driver), "it was stopped")
         subject.contract.everyday(driver)
 
 

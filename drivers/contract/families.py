@@ -69,7 +69,7 @@ class FamilyContract(ABC):
     def settings(self, driver: Any) -> None:
         """Set what is within limits, and what is beyond, which has to be refused."""
 
-    def is_safe(self, driver: Any) -> None:
+    def require_safe(self, driver: Any) -> None:
         """Whether it is in its safe state; where that can't be asked, whether it works on."""
         self.everyday(driver)
 
@@ -109,7 +109,7 @@ class MonochromatorContract(FamilyContract):
         for wrong_um in (-1.0, 1e9):
             require_refused(lambda wrong_um=wrong_um: driver.set_slit_um(wrong_um), f"a slit of {wrong_um} um")  # type: ignore[misc]
 
-    def is_safe(self, driver: Monochromator) -> None:
+    def require_safe(self, driver: Monochromator) -> None:
         require(not driver.shutter_is_open(), "its shutter is open")
 
 

@@ -81,12 +81,25 @@ class RealInstrument(Peer):
 
 
 def peers() -> dict[str, EntryPoint]:
-    """Return the peers that installed packages offer, by the driver's name (`family.name`)."""
+    """Return the peers that installed packages offer, by the driver's name (`family.name`).
+
+    >>> "monochromator.cornerstone260" in peers()
+    True
+    """
     return {point.name: point for point in entry_points(group=GROUP)}
 
 
 def start_peer(reference: str) -> Peer:
-    """Return the peer that `module:callable` makes. Raises `InstrumentError` where there is none."""
+    """Return the peer that a reference makes.
+
+    reference : `module:callable`
+
+    Raises `InstrumentError` where there is none.
+
+    >>> with start_peer("mocks.peers:prompt_stage") as peer:
+    ...     isinstance(peer, Peer)
+    True
+    """
     module, _, name = reference.partition(":")
     try:
         make: Callable[[], Peer] = getattr(import_module(module), name)

@@ -131,7 +131,7 @@ class Monochromator(Instrument):
         return not self.shutter_is_open()
 
     def shut_at_once(self) -> bool:
-        """Close the shutter before anything else is said: the first thing after a crash, and in a halt.
+        """Close the shutter before any other command: the first thing after a crash, and in a halt.
 
         Returns whether the instrument answered that it is closed; False where it needs to be spoken to first. `connect`
         and `stop` follow in any case. Raises `InstrumentError` where it isn't reached.

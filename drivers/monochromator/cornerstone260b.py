@@ -1,7 +1,7 @@
 """Newport Cornerstone 260B and 130B on USB: USBTMC, SCPI-like commands. Motions overlap; `idle?` says when all have
 ended.
 
-After each command the driver asks `system:error?`: the instrument says of no command that it wasn't obeyed. Source:
+After each command the driver asks `system:error?`: the instrument reports no failed command by itself. Source:
 Newport, MCS260B manual, p. 43-46, 62.
 """
 

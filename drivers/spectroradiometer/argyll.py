@@ -217,20 +217,20 @@ class Argyll(WireInstrument, Spectroradiometer):
 
     def _spectrum(self, said: str) -> Spectrum:
         """Return the spectrum that it printed, in mW sr^-1 m^-2 nm^-1 there."""
-        found = _SPECTRUM.search(said)
-        if found is None:
+        match = _SPECTRUM.search(said)
+        if match is None:
             if "Result is XYZ" in said or "didn't return spectral" in said:
                 raise Refused(
                     f"{self._line.name}: it gives colours and no spectrum; a spectrometer is needed", NO_SPECTRUM
                 )
             raise self._strange(said)
         try:
-            first_nm, last_nm, steps = float(found[1]), float(found[2]), int(found[3])
-            value = np.array([float(word) for word in found[4].replace(",", " ").split()])
+            first_nm, last_nm, steps = float(match[1]), float(match[2]), int(match[3])
+            value = np.array([float(word) for word in match[4].replace(",", " ").split()])
         except ValueError:
-            raise self._strange(found[0]) from None
+            raise self._strange(match[0]) from None
         if value.size != steps or steps < 2 or not last_nm > first_nm or not np.all(np.isfinite(value)):
-            raise self._strange(found[0])
+            raise self._strange(match[0])
         return Spectrum.of(np.linspace(first_nm, last_nm, steps), value / _MW_PER_W)
 
     def _make_safe(self) -> None:
@@ -251,5 +251,5 @@ class Argyll(WireInstrument, Spectroradiometer):
 
 def _find(pattern: str, text: str) -> str:
     """Return the first group of the first place that fits, or nothing."""
-    found = re.search(pattern, text)
-    return found[1].strip() if found else ""
+    match = re.search(pattern, text)
+    return match[1].strip() if match else ""

@@ -4,7 +4,7 @@ An answer begins with `OK00`, or is an error code `ERnn`. MEAS,1 answers twice: 
 takes, and once it is done. Sources: public clients (TU Berlin's MATLAB toolbox: commands, error codes, the four pieces
 of a spectrum, lines that end LF; a Python client: `MEAS,0` cancels). Unverified, as no manual was at hand: the order of
 IDDR's fields, what a measurement under way answers to other commands, and the speed of the port, which counts for
-nothing on a virtual one. The integration time (MEDR,0,0,1 is said to have it) isn't read.
+nothing on a virtual one. The integration time (MEDR,0,0,1 may have it) isn't read.
 """
 
 from __future__ import annotations

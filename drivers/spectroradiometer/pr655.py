@@ -2,7 +2,7 @@
 quality code.
 
 Sources: PR-655 manual, p. 127; what public clients expect where it leaves room. A spectrum has one or two lines before
-its values (both are told in public), the wavelengths stand beside the values, so their step is the instrument's own.
+its values (both are documented), the wavelengths stand beside the values, so their step is the instrument's own.
 """
 
 from __future__ import annotations

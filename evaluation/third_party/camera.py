@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from evaluation.third_party.models import SimulatedOptics, SimulatedSensor
 from lab.formats.recording_set import Manifest, RecordingSet
+from sim.sensor.margins import NO_MARGINS
 from sim.spectrum import FloatArray, Spectrum
 
 BLACK_DN, WHITE_DN = 100.0, 4095.0
@@ -101,7 +102,8 @@ def record_sensor(name: str, camera: DrawnCamera, sensor: SimulatedSensor, rng: 
 
     def expose(kind: str, light_e: float, exposure_s: float, **keys: Any) -> None:
         mean_e = light_e * camera.prnu + dark_e_per_s * exposure_s
-        signal_e = sensor.read(sensor.collect(mean_e, exposure_s, rng), rng) + camera.dsnu_e
+        dsnu_e = sensor.margins.surround(camera.dsnu_e)
+        signal_e = sensor.read(sensor.collect(mean_e, exposure_s, rng), rng) + dsnu_e
         session.add(kind, camera.convert(signal_e, rng), exposure_s, **keys)
 
     for exposure_s in (0.05, 2.0, 4.0):
@@ -118,7 +120,8 @@ def record_sensor(name: str, camera: DrawnCamera, sensor: SimulatedSensor, rng: 
     if sensor.plan == "dark after bright":
         for _ in range(9):
             expose("dark", 0.0, 4.0)
-    return session.recordings(name, {})
+    stated = {} if sensor.margins == NO_MARGINS else {"margins": sensor.margins.model_dump()}
+    return session.recordings(name, {}, **stated)
 
 
 def record_optics(name: str, camera: DrawnCamera, optics: SimulatedOptics, rng: np.random.Generator) -> RecordingSet:

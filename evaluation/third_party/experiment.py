@@ -35,12 +35,13 @@ Draw = Callable[[np.random.Generator, DrawnCamera], SimulatedSensor | SimulatedO
 @dataclass(frozen=True)
 class Source:
     """A model of a simulator. `effect`: the library's name of it, None of healthy cameras. `also`: of a
-    second effect of the camera."""
+    second effect of the camera. `pitch_um`: of its pixels, in place of the drawn camera's."""
 
     simulator: str
     draw: Draw
     effect: str | None
     also: str | None = None
+    pitch_um: float | None = None
 
 
 #: Models by the name under which they are asked for.
@@ -69,7 +70,8 @@ SOURCES: dict[str, Source] = {
     "healthy_dark_current": Source("Pyxel", by_pyxel.PyxelDark.draw, None),
     "persistence_of_three_traps": Source("Pyxel", by_pyxel.PyxelPersistence.draw_several, "persistence"),
     "column_gain": Source("Pyxel", by_pyxel.Columns.draw, "column_gain"),
-    "cosmic_rays": Source("Pyxel", by_pyxel.Protons.draw, "cosmic_rays"),
+    "cosmic_rays": Source("Pyxel", by_pyxel.Protons.draw, "cosmic_rays", pitch_um=24.0),
+    "charge_transfer_into_overscan": Source("Pyxel", by_pyxel.OverscanTransfer.draw, "charge_transfer_inefficiency"),
 }
 
 
@@ -77,6 +79,8 @@ def draw_set(source: str, number: int) -> tuple[RecordingSet, dict[str, float], 
     """Return set `number` of a source, the truth by the library's parameters, and the check of its simulator."""
     rng = np.random.default_rng([SEED, list(SOURCES).index(source), number])
     camera = draw_camera(rng)
+    if (pitch_um := SOURCES[source].pitch_um) is not None:
+        camera = replace(camera, pitch_um=pitch_um)
     model = SOURCES[source].draw(rng, camera)
     record = (
         partial(record_optics, optics=model)

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from sim.sensor.margins import NO_MARGINS, Margins
 from sim.spectrum import FloatArray
 
 Kind = Literal["electronic", "optical"]
@@ -41,8 +42,13 @@ class SimulatedSensor:
     truth: Mapping[str, float] = field(default_factory=dict)
     plan: Literal["usual", "dark after bright", "faint flats", "hot pixels"] = "usual"
 
+    @property
+    def margins(self) -> Margins:
+        """Margins of what `collect` and `read` return."""
+        return NO_MARGINS
+
     def collect(self, mean_e: FloatArray, exposure_s: float, rng: np.random.Generator) -> FloatArray:
-        """Return the electrons (rows, cols) that a frame of `mean_e` collects."""
+        """Return the electrons (rows, cols) that a frame of `mean_e` collects, with its margins."""
         return rng.poisson(mean_e).astype(float)
 
     def read(self, electrons: FloatArray, rng: np.random.Generator) -> FloatArray:

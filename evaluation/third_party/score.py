@@ -97,3 +97,27 @@ def table(results: Iterable[Diagnosed]) -> str:
             f"{sum(not one.names for one in use)} | {right} | {cpu_s} |"
         )
     return "\n".join(lines)
+
+
+def size_table(results: Iterable[Diagnosed]) -> str:
+    """Return the sizes as Markdown, a row a parameter of a model: how many lie within two standard deviations of the
+    simulator's, their ratio to it, and the standard deviation that was reported, over the truth."""
+    lines = [
+        "| model | parameter | sets | within 2 σ | found over true, median | reported σ over true, median |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    found: dict[tuple[str, str], list[ScoredSize]] = {}
+    for one in results:
+        for size in one.sizes if one.is_checked else ():
+            found.setdefault((one.source, size.name), []).append(size)
+    for (source, name), sizes in found.items():
+        ratio, std = (
+            np.median([value / abs(size.truth) for value, size in zip(values, sizes, strict=True)])
+            for values in (
+                [size.value * np.sign(size.truth) for size in sizes],
+                [(size.high - size.low) / 4.0 for size in sizes],
+            )
+        )
+        right = share_with_interval(sum(size.is_right for size in sizes), len(sizes))
+        lines.append(f"| {source} | `{name}` | {len(sizes)} | {right} | {ratio:.3f} | {std:.3f} |")
+    return "\n".join(lines)

@@ -148,7 +148,16 @@ def _select_models() -> Any:
 
 
 def records(store: Store, after: str | None = None, limit: int | None = None) -> list[CameraModelRecord]:
-    """Return camera models, the newest first: `limit` at most, those that follow `after` in this order."""
+    """Return camera models, the newest first.
+
+    after : id of the model that they follow in this order
+    limit : how many at most
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     records(Store(Path(folder)))
+    []
+    """
     asked = _select_models().order_by(ResultRow.created.desc(), ResultRow.id.desc()).limit(limit)
     with store.reading() as db:
         if after is not None:

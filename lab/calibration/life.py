@@ -347,6 +347,12 @@ def calibrations(store: Store, after: str | None = None, limit: int | None = Non
 
     after : id of the calibration that they follow in this order
     limit : how many at most
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     calibrations(Store(Path(folder)))
+    []
     """
     register(store)
     asked = _select_rows().order_by(CalibrationRow.created.desc(), CalibrationRow.id.desc()).limit(limit)
@@ -360,7 +366,14 @@ def calibrations(store: Store, after: str | None = None, limit: int | None = Non
 
 
 def count_calibrations(store: Store) -> int:
-    """Return how many calibrations there are."""
+    """Return how many calibrations there are.
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     count_calibrations(Store(Path(folder)))
+    0
+    """
     register(store)
     with store.reading() as db:
         return db.scalars(sa.select(sa.func.count()).select_from(CalibrationRow)).one()
@@ -584,7 +597,7 @@ def _significance(a: Figure, b: Figure) -> float:
         ComparedNumbers(figure.name, np.array([figure.value]), np.array([figure.std]), sensor=figure.sensor)
         for figure in (a, b)
     )
-    at_same_temperature, std = two.beside(first)
+    at_same_temperature, std = two.at_temperature_of(first)
     difference = float(at_same_temperature.value[0]) - a.value
     if std[0] == 0.0:
         return 0.0 if difference == 0.0 else sigma_of_probability(0.0)

@@ -104,7 +104,7 @@ class Limit(Frozen):
     warn: tuple[float | None, float | None] | None = None
 
     @model_validator(mode="after")
-    def _ordered(self) -> Self:
+    def _check_order(self) -> Self:
         if self.good == (None, None):
             raise ValueError("good: has no end; give one at least")
         for name, band in (("good", self.good), ("warn", self.warn or self.good)):

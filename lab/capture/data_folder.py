@@ -12,7 +12,15 @@ if TYPE_CHECKING:
 
 
 def open_store(folder: Path | None = None) -> Store:
-    """Open the data folder: `folder`, else what CALIBENCH_DATA says; made if it isn't there."""
+    """Open the data folder; it is made if it isn't there.
+
+    folder : by default what CALIBENCH_DATA says, else `calibench-data`
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     open_store(Path(folder) / "data").sessions()
+    []
+    """
     from lab.capture.settings import Settings
     from lab.capture.store import Store
 

@@ -442,8 +442,8 @@ class Shot:
 
 
 def level_of(frame: NDArray[np.uint16], sheet: DataSheet) -> float:
-    """Level of a frame (rows, cols), a share of its range: (p - black level) / range, where p is the brightest
-    channel's 99.5th percentile.
+    """Level of a frame (rows, cols with the margins), a share of its range: (p - black level) / range, where p is the
+    99.5th percentile of the brightest channel in the active area.
 
     The range (DN) goes from the black level to the code of saturation, or to the data sheet's full well where that is
     lower. A percentile, because a hot pixel must not set the exposure; channel by channel, because a chart's white
@@ -454,7 +454,8 @@ def level_of(frame: NDArray[np.uint16], sheet: DataSheet) -> float:
     if sheet.full_well_e is not None and sheet.conversion_gain_dn_per_e is not None:
         top = min(top, black + sheet.full_well_e * sheet.conversion_gain_dn_per_e)
     step = 1 if sheet.cfa == "MONO" else 2
-    brightest = max(_percentile(frame[row::step, col::step], 99.5) for row in range(step) for col in range(step))
+    active = sheet.margins.active(frame)
+    brightest = max(_percentile(active[row::step, col::step], 99.5) for row in range(step) for col in range(step))
     return (brightest - black) / (top - black)
 
 
@@ -540,11 +541,12 @@ class CamerasDevice(Device):
             frames = dict(zip(self.cameras, together, strict=True))
             for side, frame in frames.items():
                 sheet = self.sheets[side]
-                if frame.raw.shape != (sheet.rows, sheet.cols):
+                if frame.raw.shape != sheet.frame_shape:
+                    rows, cols = sheet.frame_shape
                     raise InstrumentError(
                         f"camera {side}: a frame of {frame.raw.shape[0]} x {frame.raw.shape[1]} pixels came, the data "
                         "sheet in "
-                        f"the station file says {sheet.rows} x {sheet.cols}; correct rows and cols there, or the "
+                        f"the station file says {rows} x {cols}; correct rows and cols, or the margins, there, or the "
                         "camera's region"
                     )
             self._keep(frames, shot)

@@ -101,7 +101,15 @@ class Generation:
 
 
 def generations_of(backup: Path) -> list[Generation]:
-    """Return the generations of a backup, the newest first."""
+    """Return the generations of a backup, the newest first.
+
+    backup : its folder
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     generations_of(Path(folder))
+    []
+    """
     folders = [record_file.parent for record_file in backup.glob(f"[0-9]*/{RECORD}")]
     return [Generation(folder) for folder in sorted(folders, key=lambda folder: folder.name, reverse=True)]
 
@@ -126,10 +134,20 @@ def sha256_of(file: Path) -> str:
 
 
 def copy_hashed(source: Path, made: Path) -> FileSum:
-    """Copy a file with its time and its permissions, flushed to the disk; returns the sum of what was copied.
+    """Copy a file with its time and its permissions, flushed to the disk.
 
-    No link is followed. The time is that of before the reading, so that a file which was written meanwhile counts as
-    changed.
+    source : no link is followed
+    made : where the copy is made
+
+    Returns the sum of what was copied. Its time is that of before the reading, so that a file which was written
+    meanwhile counts as changed.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     (Path(folder) / "dark-1.npy").touch()
+    ...     _ = copy_hashed(Path(folder) / "dark-1.npy", Path(folder) / "copy")
+    ...     (Path(folder) / "copy").is_file()
+    True
     """
     made.parent.mkdir(parents=True, exist_ok=True)
     digest, size = hashlib.sha256(), 0
@@ -151,7 +169,18 @@ def copy_hashed(source: Path, made: Path) -> FileSum:
 
 
 def link_or_copy(source: Path, made: Path) -> None:
-    """Make a second name of a file; a copy on disks that have no hard links, or where the file has too many."""
+    """Make a second name of a file; a copy on disks that have no hard links, or where the file has too many.
+
+    source : the file
+    made : its second name
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     (Path(folder) / "dark-1.npy").touch()
+    ...     link_or_copy(Path(folder) / "dark-1.npy", Path(folder) / "second")
+    ...     (Path(folder) / "second").is_file()
+    True
+    """
     made.parent.mkdir(parents=True, exist_ok=True)
     made.unlink(missing_ok=True)
     try:
@@ -208,7 +237,15 @@ def is_intact_registry(file: Path) -> bool:
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder under a name that begins with a point first, so that a half removed one is no generation."""
+    """Remove a folder, under a name that begins with a point first, so that a half removed one is no generation.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     (Path(folder) / "20300101" / "frames").mkdir(parents=True)
+    ...     remove_tree(Path(folder) / "20300101")
+    ...     list(Path(folder).iterdir())
+    []
+    """
     away = folder if folder.name.startswith(".") else folder.with_name(f".removed-{folder.name}")
     if folder.exists():
         folder.rename(away)

@@ -257,7 +257,7 @@ class Instruments:
 def _snapshot(driver: Instrument) -> InstrumentSnapshot:
     """Return what a connected instrument says of itself. Raises InstrumentError."""
 
-    def told(values: Mapping[str, Setting]) -> dict[str, Setting]:
+    def with_finite_numbers(values: Mapping[str, Setting]) -> dict[str, Setting]:
         return {
             key: str(setting) if isinstance(setting, float) and not math.isfinite(setting) else setting
             for key, setting in values.items()
@@ -265,8 +265,8 @@ def _snapshot(driver: Instrument) -> InstrumentSnapshot:
 
     return InstrumentSnapshot(
         **vars(driver.identity()),
-        settings=told(driver.settings()),
-        found=told(driver.found()),
+        settings=with_finite_numbers(driver.settings()),
+        found=with_finite_numbers(driver.found()),
         departures=driver.departures(),
     )
 
@@ -320,11 +320,11 @@ def contradiction(side: str, sensor: SensorInfo, sheet: DataSheet) -> str | None
     """Return what a camera says of itself that its data sheet in the station file contradicts, in a line; None:
     nothing."""
     where = "its data sheet in the station file says"
-    if (sensor.rows, sensor.cols) != (sheet.rows, sheet.cols):
+    if (sensor.rows, sensor.cols) != sheet.frame_shape:
+        rows, cols = sheet.frame_shape
         return (
-            f"camera {side}: has {sensor.rows} x {sensor.cols} pixels, {where} {sheet.rows} x {sheet.cols}; correct "
-            "rows and cols "
-            "there, or the camera's region"
+            f"camera {side}: has {sensor.rows} x {sensor.cols} pixels, {where} {rows} x {cols}; correct rows and cols, "
+            "or the margins, there, or the camera's region"
         )
     if sensor.cfa not in (None, sheet.cfa):
         return f"camera {side}: says its colour filters are {sensor.cfa}, {where} {sheet.cfa}; correct cfa there"

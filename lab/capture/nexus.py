@@ -39,7 +39,7 @@ def _chunks(recordings: RecordingSet, captures: Sequence[Capture]) -> Generator[
     """Yield the frames as chunks, packed by threads. Closing it drops those that weren't begun: leaving the pool alone
     would pack them all."""
     with ThreadPoolExecutor(_PACKERS, thread_name_prefix="pack") as pool:
-        yield from pool.map(lambda capture: _chunk(recordings.frame(capture)), captures)
+        yield from pool.map(lambda capture: _chunk(recordings.whole_frame(capture)), captures)
 
 
 @contextlib.contextmanager
@@ -91,9 +91,9 @@ def write_nexus(
             detector = _group(instrument, side, "NXdetector")
             data = detector.create_dataset(
                 "data",
-                shape=(len(mine), camera.rows, camera.cols),
+                shape=(len(mine), *camera.frame_shape),
                 dtype=np.dtype("<u2"),
-                chunks=(1, camera.rows, camera.cols) if mine else None,
+                chunks=(1, *camera.frame_shape) if mine else None,
                 compression="gzip" if mine else None,
                 compression_opts=_GZIP_LEVEL if mine else None,
                 shuffle=bool(mine),

@@ -78,12 +78,16 @@ def _is_changed_again(step: Step, following: Step, kinds: Mapping[str, type[Adju
 def full_plan(
     station: Equipment, quick: bool = False, only: Collection[str] | None = None, parameters: Parameters | None = None
 ) -> CapturePlan:
-    """Return a plan of every sequence whose instruments and targets the station has. `quick` takes fewer frames of
-    each.
+    """Return a plan of every sequence whose instruments and targets the station has.
 
-    `only`: names of the sequences to take. `parameters`: values in place of those that a full session has. Raises
-    InputError where the station can't take one of the sequences, and for a parameter that none of them has or that is
-    out of its bounds."""
+    station : whose instruments and targets count
+    quick : take fewer frames of each
+    only : names of the sequences to take
+    parameters : values in place of those that a full session has, by sequence and name
+
+    Raises InputError where the station can't take one of the sequences, and for a parameter that none of them has or
+    that is out of its bounds.
+    """
     possible = [planned for kind in SEQUENCES.values() if (planned := kind.planned(station, quick)) is not None]
     taken = possible if only is None else _only(possible, only)
     wanted = parameters or {}

@@ -34,7 +34,14 @@ class QueuedSession(Frozen):
 
 
 def queue(store: Store) -> list[QueuedSession]:
-    """Return the queued sessions in their order."""
+    """Return the queued sessions in their order.
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     queue(Store(Path(folder)))
+    []
+    """
     with store.reading() as db:
         return [
             QueuedSession(
@@ -78,8 +85,21 @@ def expected_times(
 ) -> dict[str, tuple[datetime, datetime]]:
     """Return when each session of the queue is expected to start and to end, as the queue starts them from `at` on.
 
-    `addresses`, `duration_s`: of each session. `busy_until`: of the instruments in use now, by address; None: not
-    known. A session that is held, or waits for an instrument of which that isn't known, isn't in the answer."""
+    waiting : the queue, in its order
+    addresses, duration_s : instruments, and estimated time, of each session by its id
+    busy_until : of the instruments in use now, by address; None: not known
+    at : now, UTC
+
+    A session that is held, or waits for an instrument of which that isn't known, isn't in the answer.
+
+    >>> at = datetime(2030, 1, 1, tzinfo=UTC)
+    >>> sessions = [QueuedSession(id=id, name="", station="bench", place=n, not_before=None, held=None)
+    ...     for n, id in enumerate("ab", start=1)]
+    >>> one_bench = dict.fromkeys("ab", frozenset({"COM1"}))
+    >>> expected = expected_times(sessions, one_bench, {"a": 60.0, "b": 60.0}, {}, at)
+    >>> (expected["b"][0] - at).total_seconds()
+    60.0
+    """
     times: dict[str, tuple[datetime, datetime]] = {}
     until = dict(busy_until)
     moments = [at]

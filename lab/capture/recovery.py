@@ -44,12 +44,12 @@ def make_station_safe(
         shutter: Shutter = "none" if station.monochromator is None else "unknown"
         return SafeState(shutter=shutter, complaints=(str(error),), at=now())
 
-    def reached(driver: Instrument) -> None:
+    def shut_and_connect(driver: Instrument) -> None:
         if isinstance(driver, Monochromator) and driver.shut_at_once():
             on_shut()
         driver.connect()
 
-    states, until = made_safe(drivers, reached, on_shut), time.monotonic() + STOP_S
+    states, until = made_safe(drivers, shut_and_connect, on_shut), time.monotonic() + STOP_S
     closing = [in_thread(driver.close) for driver in drivers.all.values()]
     for done in closing:
         try:
@@ -101,7 +101,7 @@ class Recovery:
         self._looked.wait(patience_s)
 
     def resume_with(
-        self, resume: Callable[[str], None], note: Callable[[Station, SafeState], None] = lambda station, found: None
+        self, resume: Callable[[str], None], note: Callable[[Station, SafeState], None] = lambda station, state: None
     ) -> None:
         """Set the functions that resume a session and that keep what a station's instruments have answered; sessions
         that waited are resumed now."""

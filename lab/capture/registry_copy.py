@@ -79,7 +79,13 @@ def load_registry(registry: Path, url: str) -> None:
 
 
 def count_sessions(url: str) -> int:
-    """Return how many sessions a database has; 0 where it has no tables."""
+    """Return how many sessions a database has; 0 where it has no tables.
+
+    url : as SQLAlchemy writes it
+
+    >>> count_sessions("sqlite://")
+    0
+    """
     engine = open_engine(url)
     try:
         with engine.connect() as connection:

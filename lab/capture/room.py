@@ -31,8 +31,16 @@ _DELETE = (
 def why_unwritable(
     folder: Path, files: tuple[Path, ...] = (), make_room: str = "make room there"
 ) -> CannotWrite | None:
-    """Return why nothing can be written into a folder and into files in it; None: it can, as far as is known.
-    `make_room`: what makes room on its disk."""
+    """Return why nothing can be written into a folder and into files in it; None where it can, as far as is known.
+
+    folder, files : that are going to be written
+    make_room : what makes room on its disk, for the message
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     why_unwritable(Path(folder)) is None
+    True
+    """
     try:
         free_bytes = _free_bytes(folder)
         is_read_only = bool(os.statvfs(folder).f_flag & os.ST_RDONLY)

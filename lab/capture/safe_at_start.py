@@ -126,7 +126,7 @@ class Rescue:
     """The stations of all sessions that are recorded as under way and that no process runs, being made safe: motion
     ends, shutters close, screens go dark.
 
-    Raises nothing: what doesn't succeed here is tried again, and told, by the recovery. `tell`: called with a line
+    Raises nothing: what doesn't succeed here is tried again, and reported, by the recovery. `tell`: called with a line
     where a shutter is closed, and where a whole station is safe.
     """
 
@@ -208,7 +208,7 @@ def wait_until_safe_at_start() -> dict[str, Lock]:
 
 
 def _check_shut(monochromator: Any) -> None:
-    """Raise OSError where a monochromator says that its shutter is open, also after it was told to close it."""
+    """Raise OSError where a monochromator says that its shutter is open, also after it was closed."""
     if monochromator.shutter_is_open():
         monochromator.close_shutter()
         if monochromator.shutter_is_open():

@@ -42,7 +42,7 @@ def self_tests(drivers: Drivers, sheets: Mapping[str, DataSheet] = MappingProxyT
     """Connect to each instrument, bring it into its safe state, use it once for its purpose, check that it is safe, and
     disconnect.
 
-    `sheets`: the cameras' data sheets by side, held against what the cameras say.
+    `sheets`: the cameras' data sheets by side, compared with what the cameras report.
     """
     for name, instrument in drivers.all.items():
         yield _self_test(name, instrument, sheets.get(name.partition(" ")[2]))
@@ -89,7 +89,7 @@ def _self_test(name: str, instrument: Instrument, sheet: DataSheet | None = None
             contract = CONTRACTS[name.split(maxsplit=1)[0]]
             contract.everyday(instrument)
             instrument.stop()
-            contract.is_safe(instrument)
+            contract.require_safe(instrument)
             works, words = True, "works, and is in its safe state"
             if sheet is not None and isinstance(instrument, Camera):
                 difference = contradiction(name.partition(" ")[2], instrument.sensor(), sheet)

@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import math
 import os
 import platform
 import signal
@@ -391,7 +392,7 @@ class CaptureSession:
         """Take a step and keep what it took, once the disk has room for that: until then the run is paused, shutter
         closed, screen dark. A step whose files a full disk didn't take is taken again."""
         sheets = {side: camera.datasheet for side, camera in self.station.cameras.items()}
-        wanted_bytes = sum(2 * sheets[capture.side].rows * sheets[capture.side].cols for capture in step.captures)
+        wanted_bytes = sum(2 * math.prod(sheets[capture.side].frame_shape) for capture in step.captures)
         failures = 0
         while True:
             if self._lacks is None:

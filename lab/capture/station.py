@@ -219,7 +219,17 @@ def _complaints(error: ValidationError) -> Iterator[str]:
 
 
 def read_station(path: str | Path) -> Station:
-    """Return the station in a TOML file. Raises InputError, one line that names every wrong key."""
+    r"""Return the station in a TOML file. Raises InputError, one line that names every wrong key.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "station.toml"
+    ...     left = 'driver = "u3v"\naddress = "usb://CAM-1"\n'
+    ...     sheet = 'rows = 480\ncols = 640\ncfa = "MONO"\nbit_depth = 12\n'
+    ...     _ = file.write_text(f'name = "bench"\n[cameras.left]\n{left}[cameras.left.datasheet]\n{sheet}')
+    ...     read_station(file).name
+    'bench'
+    """
     file = Path(path)
     tables = read_toml(file, "give a station file, `calibench bench --station FILE` writes one")
     try:
@@ -270,10 +280,10 @@ def drivers_of(station: Station) -> Drivers:
     """Return the drivers that a station file names. Raises InputError for settings that a driver doesn't know,
     DeviceError if there is no such driver."""
 
-    def made(family: str, entry: Address | None) -> Any:
+    def make_driver(family: str, entry: Address | None) -> Any:
         return entry and _make(family, family, entry.driver, entry.address, entry.settings)
 
-    stage = made("stage", station.stage)
+    stage = make_driver("stage", station.stage)
     if stage is not None:
         stage.instruct({name: target.instruction for name, target in station.targets.items()})
     return Drivers(
@@ -282,9 +292,9 @@ def drivers_of(station: Station) -> Drivers:
             for side, entry in station.cameras.items()
         },
         stage=stage,
-        monochromator=made("monochromator", station.monochromator),
-        spectroradiometer=made("spectroradiometer", station.spectroradiometer),
-        display=made("display", station.display),
-        photodiode=made("photodiode", station.photodiode),
-        light_source=made("light_source", station.light_source),
+        monochromator=make_driver("monochromator", station.monochromator),
+        spectroradiometer=make_driver("spectroradiometer", station.spectroradiometer),
+        display=make_driver("display", station.display),
+        photodiode=make_driver("photodiode", station.photodiode),
+        light_source=make_driver("light_source", station.light_source),
     )

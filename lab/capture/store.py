@@ -162,9 +162,17 @@ class Store:
         notes: str = "",
         demands_certified: bool = False,
     ) -> str:
-        """Register a session with all its steps; nothing is captured yet. Returns its id. `demands_certified`: it runs
-        only with cameras that have a certified calibration. Raises NoRoom where the disk is full; then nothing of it
-        stays."""
+        """Register a session with all its steps; nothing is captured yet.
+
+        station : on which it is captured
+        steps : in order
+        plan : sequences and parameters of which the steps follow
+        patterns : cells of the screen's patterns, by path
+        name, notes : by its operator
+        demands_certified : it runs only with cameras that have a certified calibration
+
+        Returns its id. Raises NoRoom where the disk is full; then nothing of it stays.
+        """
         check_line("name", name)
         check_line("notes", notes, several_lines=True)
         self.room.check()
@@ -276,7 +284,16 @@ class Store:
         return again.model_copy(update={"state": "interrupted", "error": why})
 
     def session(self, session_id: str) -> SessionInfo:
-        """Return a session."""
+        """Return a session. Raises InputError where there is none of that id.
+
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     try:
+        ...         Store(Path(folder)).session("20300101-101500-7f3ad2")
+        ...     except InputError as error:
+        ...         print("20300101-101500-7f3ad2" in str(error))
+        True
+        """
         with self.reading() as db:
             info = self._info(db, self._row(db, session_id))
         return self._now(info)
@@ -289,10 +306,18 @@ class Store:
         search: str = "",
         only: Sequence[str] | None = None,
     ) -> list[SessionInfo]:
-        """Return sessions, the newest first: `limit` at most, those that follow the session `after` in this order.
+        """Return sessions, the newest first.
 
-        `search`: only those that have each of its words in their id, name, notes, their station's name or what their
-        instruments reported. `only`: ids of those that are asked for."""
+        after : id of the session that they follow in this order
+        limit : how many at most
+        search : words, each of which their id, name, notes, their station's name or what their instruments reported has
+        only : ids of those that are asked for
+
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     Store(Path(folder)).sessions()
+        []
+        """
         documents = (
             SessionRow.station,
             SessionRow.cameras,

@@ -117,10 +117,10 @@ def find_exposure(
     where a camera missed the level."""
     limits = instruments.limits
 
-    def bounded(exposure_s: float) -> float:
+    def clip_to_limits(exposure_s: float) -> float:
         return float(np.clip(exposure_s, limits.exposure_min_s, limits.exposure_max_s))
 
-    exposure_s = {side: bounded(start_s[side]) for side in instruments.cameras.cameras}
+    exposure_s = {side: clip_to_limits(start_s[side]) for side in instruments.cameras.cameras}
     levels: dict[Side, float] = {}
     before: tuple[dict[Side, float], dict[Side, float]] | None = None
     for _ in range(TRIES):
@@ -136,7 +136,7 @@ def find_exposure(
                 factor = 10.0
             else:
                 factor = wanted.level / level
-            following[side] = bounded(exposure_s[side] * factor)
+            following[side] = clip_to_limits(exposure_s[side] * factor)
         if following == exposure_s:
             break
         before, exposure_s = (exposure_s, levels), following
@@ -157,7 +157,13 @@ def _stuck(
 
 
 def repeats_ahead(steps: Sequence[Step | None]) -> list[int]:
-    """Return how many of the steps that follow each at once only repeat its exposure; None: a step that isn't taken."""
+    """Return how many of the steps that follow each at once only repeat its exposure.
+
+    steps : in order; None: a step that isn't taken
+
+    >>> repeats_ahead([None, None])
+    [0, 0]
+    """
     counts = [0] * len(steps)
     for at in range(len(steps) - 2, -1, -1):
         step, following = steps[at], steps[at + 1]

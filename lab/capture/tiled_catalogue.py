@@ -78,7 +78,7 @@ def write_session(
     captures = session.create_container("captures")
     for number, capture in enumerate(listed, start=1):
         keys = capture.model_dump(mode="json", exclude_unset=True)
-        captures.write_array(recordings.frame(capture), key=capture.id.replace("/", "."), metadata=keys)
+        captures.write_array(recordings.whole_frame(capture), key=capture.id.replace("/", "."), metadata=keys)
         if progress:
             progress(capture.id, number / len(listed))
     named = {(what, path) for capture in listed for _, what, path in names_in(capture)}

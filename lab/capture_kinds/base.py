@@ -75,7 +75,7 @@ class ByKind(Generic[M]):
             raise ValueError(f"unknown kind {kind!r} of {self.what}; the kinds are {', '.join(self.models)}")
         return self.models[kind].model_validate(document)
 
-    def _validated(self, value: Any) -> BaseModel:
+    def _validate(self, value: Any) -> BaseModel:
         if isinstance(value, BaseModel):
             if type(value) in self.models.values():
                 return value
@@ -86,7 +86,7 @@ class ByKind(Generic[M]):
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_plain_validator_function(
-            self._validated, serialization=core_schema.simple_ser_schema("any")
+            self._validate, serialization=core_schema.simple_ser_schema("any")
         )
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -193,7 +193,13 @@ def _mark(annotation: Any) -> Names | None:
 
 
 def names_in(item: Open) -> Iterator[tuple[str, Names, str]]:
-    """Yield (dotted key, what it names, value) of every key of a manifest's object that names something."""
+    """Yield (dotted key, what it names, value) of every key of a manifest's object that names something.
+
+    >>> from lab.capture_kinds.dark import DarkCapture
+    >>> dark = DarkCapture(kind="dark", id="dark-1", side="left", frame="frames/dark-1.npy", exposure_s=0.1)
+    >>> ("frame", "frames/dark-1.npy") in [(key, value) for key, _, value in names_in(dark)]
+    True
+    """
     for key, field in type(item).model_fields.items():
         value = getattr(item, key)
         if isinstance(value, Open):
@@ -210,7 +216,13 @@ O = TypeVar("O", bound=Open)  # noqa: E741
 
 
 def in_folder(item: O, folder: str) -> O:
-    """Return the same object, each name and path in it prefixed by `folder/`."""
+    """Return the same object of a manifest, each name and path in it prefixed by `folder/`.
+
+    >>> from lab.capture_kinds.dark import DarkCapture
+    >>> dark = DarkCapture(kind="dark", id="dark-1", side="left", frame="frames/dark-1.npy", exposure_s=0.1)
+    >>> in_folder(dark, "later").frame
+    'later/frames/dark-1.npy'
+    """
     paths = {key: f"{folder}/{name}" for key, _, name in names_in(item) if "." not in key}
     nested = {key: in_folder(value, folder) for key, value in item if isinstance(value, Open)}
     return item.model_copy(update=paths | nested)
@@ -266,7 +278,7 @@ class CaptureLimits(Frozen):
     flat_wavelength_nm: float | None = Field(default=None, gt=0)  # None: white light
 
     @model_validator(mode="after")
-    def _ordered(self) -> Self:
+    def _check_order(self) -> Self:
         if self.exposure_min_s > self.exposure_max_s:
             raise ValueError(
                 f"exposure_min_s: {self.exposure_min_s:g} s is above exposure_max_s, {self.exposure_max_s:g} s; "

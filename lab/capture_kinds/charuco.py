@@ -110,7 +110,7 @@ class CharucoCapture(Capture):
     @model_validator(mode="before")
     @classmethod
     def _without_markers(cls, stated: Any) -> Any:
-        """A marker of 0 mm is none: the board is a plain checkerboard, unless it is said to be a grid of dots."""
+        """Take a marker of 0 mm for none: the board is a plain checkerboard, unless its dictionary is `dots`."""
         try:
             none = isinstance(stated, dict) and float(stated["marker_mm"]) == 0.0
         except (KeyError, TypeError, ValueError):

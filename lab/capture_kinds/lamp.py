@@ -47,7 +47,13 @@ class LampLight(Frozen):
 
 
 def check_lamp(level: float, colour_temperature_k: float | None) -> None:
-    """Raises ValueError for a colour temperature of a light source that is dark."""
+    """Check the light that is asked for. Raises ValueError for a colour temperature of a light source that is dark.
+
+    level : share of its most, 0..1
+    colour_temperature_k : None where it isn't asked for
+
+    >>> check_lamp(0.5, 3000.0)
+    """
     if level == 0.0 and colour_temperature_k is not None:
         raise ValueError(
             f"colour_temperature_k: {colour_temperature_k:g} K with lamp_level = 0, at which the light source is dark; "
@@ -58,11 +64,17 @@ def check_lamp(level: float, colour_temperature_k: float | None) -> None:
 def lamp_channels(
     lights: Mapping[str, LampLight], level: float, colour_temperature_k: float | None, wavelength_nm: float = 0.0
 ) -> dict[str, float]:
-    """Return the share 0..1 of its most at which each channel is to be lit, for `level` times one of a
-    station's `lights`, by name.
+    """Return the share 0..1 of its most at which each channel is to be lit, by name.
 
-    The light is that of `colour_temperature_k` (K), or of `wavelength_nm` (nm); with neither (None, 0), the first of
-    the station file. Raises InputError where there is none.
+    lights : of the station, by name
+    level : share of the light
+    colour_temperature_k, wavelength_nm : of the light; with neither (None, 0), it is the first of the station file
+
+    Raises InputError where there is no such light.
+
+    >>> lights = {"white": LampLight(colour_temperature_k=3000.0, channels={"warm": 1.0, "cold": 0.2})}
+    >>> lamp_channels(lights, 0.5, 3000.0)
+    {'warm': 0.5, 'cold': 0.1}
     """
     if colour_temperature_k is not None:
         fit = [light for light in lights.values() if light.colour_temperature_k == colour_temperature_k]

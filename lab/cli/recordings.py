@@ -151,7 +151,7 @@ def import_(
     warn(recordings.warnings)
     warnings: list[str] = []
     with progress_bar("import") as advance:
-        folder = recording_set.write(recordings, out_folder, progress=advance, told=warnings.extend)
+        folder = recording_set.write(recordings, out_folder, progress=advance, report_warnings=warnings.extend)
     warn(tuple(warnings))
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 

@@ -29,6 +29,7 @@ from sim.scene.scenes import (
 )
 from sim.scene.warp import Warp
 from sim.sensor import electrons as sensor
+from sim.sensor.margins import NO_MARGINS, Margins
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import electron_rate
 
@@ -74,10 +75,11 @@ def reference_study(
     *,
     reflectances: tuple[Spectrum, ...] | None = None,
     reading: Callable[[FloatArray], FloatArray] = np.copy,
+    margins: Margins = NO_MARGINS,
 ) -> RecordingSet:
     """Return the recording set of the session, of both sides. `seed`: of its noise and of the random pattern; `camera`:
     on both sides, None: `reference_camera()`. `reflectances`: of the chart's patches, None: the published ones;
-    `reading`: what the radiometer reads of a radiance."""
+    `reading`: what the radiometer reads of a radiance; `margins`: of all frames."""
     rig = _rig(camera or reference_camera())
     frames: dict[str, Any] = {}
     spectra: dict[str, Spectrum] = {}
@@ -89,7 +91,8 @@ def reference_study(
     pair: tuple[tuple[Side, CameraModel], ...] = (("left", rig.left), ("right", rig.right))
     cameras = {}
     for side, own in pair:
-        drawn = _SideSession(rig, own, side, np.random.default_rng([seed, side == "right"]), reflectances, reading)
+        rng = np.random.default_rng([seed, side == "right"])
+        drawn = _SideSession(rig, own, side, rng, reflectances, reading, margins)
         drawn.session(targets)
         cameras[side] = drawn.stated()
         frames |= drawn.frames
@@ -151,10 +154,12 @@ class _SideSession:
         rng: np.random.Generator,
         reflectances: tuple[Spectrum, ...] | None,
         reading: Callable[[FloatArray], FloatArray],
+        margins: Margins,
     ) -> None:
+        self.margins = margins
         self.rig, self.camera, self.side, self.rng = rig, camera, side, rng
         self.reflectances, self.reading = reflectances, reading
-        self.pattern = sensor.FixedPattern.draw(camera, rng)
+        self.pattern = sensor.FixedPattern.draw(camera, rng).surrounded(margins)
         self.frames: dict[str, Any] = {}
         self.spectra: dict[str, Spectrum] = {}
         self.captures: list[dict[str, Any]] = []
@@ -180,6 +185,7 @@ class _SideSession:
             "focal_length_mm": lens.focal_length_mm,
             "lens_transmittance": lens.transmittance,
             "quantum_efficiency": curves,
+            "margins": self.margins,
         }
 
     def session(self, targets: dict[str, Any]) -> None:
@@ -307,13 +313,14 @@ class _SideSession:
     ) -> None:
         """Draw `repeats` captures of a scene, with `samples` a pixel. `more`: further keys of this kind of capture."""
         exposure = Exposure(scene, exposure_s, temperature_c=temperature_c, placed="image")
-        electrons = expected_electrons(self.camera, exposure, oversample=samples)
+        electrons = expected_electrons(self.camera, exposure, oversample=samples, margins=self.margins)
         for _ in range(repeats):
             k = len(self.captures)
             path = f"frames/{self.side}-{k:04d}.npy"
             self.frames[path] = sensor.sample_from(
-                electrons, self.camera, self.rng, self.pattern, dark_electrons=dark_electrons(self.camera, exposure),
-                gain_db=0.0, read_out=read_out(self.camera, exposure, ()),
+                electrons, self.camera, self.rng, self.pattern,
+                dark_electrons=dark_electrons(self.camera, exposure, (), self.margins), gain_db=0.0,
+                read_out=read_out(self.camera, exposure, (), self.margins),
             )  # fmt: skip
             self.captures.append(
                 {"id": f"{self.side}-{k:04d}", "kind": kind, "side": self.side, "frame": path, "exposure_s": exposure_s,

@@ -32,8 +32,11 @@ from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.effects.library import candidates, effects
 from sim.parameters import Frozen, Quantity
+from sim.sensor.margins import Margins
 
 TABLE = Path(__file__).with_name("visibility.toml")
+#: Of the frames from which it is derived: masked pixels before the image, overscan behind it.
+MARGINS = Margins(masked_rows=(4, 0), masked_cols=(4, 0), overscan_rows=(0, 12), overscan_cols=(0, 12))
 #: Changes below this share of a number's standard deviation are rounding.
 ROUNDING = 1e-6
 #: Numbers that a condition has to have to count as a part of a session: of fewer, nuisance parameters leave no shape to
@@ -66,7 +69,7 @@ def visibility() -> dict[str, EffectVisibility]:
 def derived_visibility(policy: DecisionPolicy | None = None) -> dict[str, EffectVisibility]:
     """Return the table, derived anew from both sides of the reference study."""
     policy = policy or DecisionPolicy()
-    recordings = reference_study()
+    recordings = reference_study(margins=MARGINS)
     kind_of = {capture.id: capture.kind for capture in recordings.captures()}
     looked_for = {kind.name for kind in candidates()}
     measurements: dict[str, dict[str, None]] = {name: {} for name in effects()}

@@ -92,7 +92,7 @@ class ComparedNumbers:
     axis: Array | None = None
     sensor: SensorTemperature | None = None
 
-    def beside(self, reference: ComparedNumbers) -> tuple[ComparedNumbers, Array]:
+    def at_temperature_of(self, reference: ComparedNumbers) -> tuple[ComparedNumbers, Array]:
         """Return the numbers as they would be at the sensor temperature of `reference`, and the standard deviation of
         their difference from it: by the fits, by the lamps' drifts and by the conversion.
 
@@ -323,7 +323,7 @@ def _align(a: ComparedNumbers, b: ComparedNumbers) -> tuple[ComparedNumbers, Com
 
 def _rows(a: ComparedNumbers, as_measured: ComparedNumbers, side: Side | None) -> Iterator[Change]:
     """Yield the rows of one name: one for each number, or that of the largest difference for a curve."""
-    b, std_of_difference = as_measured.beside(a)
+    b, std_of_difference = as_measured.at_temperature_of(a)
     parts = (a.value, b.value, a.std, b.std, std_of_difference)
     value_a, value_b, std_a, std_b, std = (np.ravel(part) for part in parts)
     # A normalised curve is 1 at frequency 0 by definition; its uncertainty and its difference there are rounding
@@ -535,8 +535,20 @@ class FailRule:
 
 
 def failures(comparison: ComparisonResult, rules: Sequence[FailRule]) -> list[str]:
-    """Return the changes that fail any rule, by name. Raises InputError for a rule that concerns no figure of the
-    comparison: a misspelt name, or a figure that one of the two fits lacks, would never fail.
+    """Return the changes that fail any rule, by name.
+
+    comparison : of two fits
+    rules : of `--fail-on`
+
+    Raises InputError for a rule that concerns no figure of the comparison: a misspelt name, or a figure that one of the
+    two fits lacks, would never fail.
+
+    >>> from lab.formats.results import CameraFit, NoiseFit
+    >>> def fitted(read_noise_e):
+    ...     noise = NoiseFit(read_noise_e=read_noise_e, read_noise_e_std=0.05)
+    ...     return FitResult(source="my-camera", cameras={"left": CameraFit(noise=noise)})
+    >>> len(failures(compare(fitted(2.0), fitted(3.0)), [FailRule.parse("noise read_noise_e>10%")]))
+    1
     """
     for rule in rules:
         if not rule.concerns(comparison):

@@ -51,7 +51,12 @@ def energy_sensitivities(camera: CameraModel) -> FloatArray:
 
 
 def list_losses(content: CameraFile) -> tuple[str, ...]:
-    """Return a remark on the effects of a camera file, which its curves don't have."""
+    """Return a remark on the effects of a camera file, which its curves don't have; none where it has no effects.
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> list_losses(default_camera())
+    ()
+    """
     names = ", ".join(effect.name for effect in content.effects)
     return (f"the curves are those of quantum_efficiency: effects aren't in them ({names})",) if names else ()
 

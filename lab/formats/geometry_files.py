@@ -8,7 +8,8 @@ The laws are those of `sim.scene.projection`, whose coefficients have the order 
     COLMAP    cameras.txt; (0.5, 0.5) is the centre of the top-left pixel, in all others (0, 0)
     mrcal     .cameramodel; the pose from the reference to the camera as Rodrigues' vector and m
 
-Coefficients that a format has no place for are fitted by those that it has, over the frame; what is left is told, px.
+Coefficients that a format has no place for are fitted by those that it has, over the frame; what is left is reported,
+px.
 """
 
 from __future__ import annotations

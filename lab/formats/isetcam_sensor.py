@@ -25,8 +25,22 @@ _LAYERS_M, _REFRACTIVE = (2e-6, 5e-6), (1.0, 2.0, 1.46, 3.5)
 
 
 def write_isetcam(file: Path, content: CameraFile) -> tuple[str, ...]:
-    """Write the struct `sensor` of a camera into a .mat file. Returns what it has no place for; raises InputError where
-    the folder can't be written to."""
+    """Write the struct `sensor` of ISETCam.
+
+    file : .mat, to be written
+    content : the camera
+
+    Returns what the struct has no place for. Raises InputError where the folder can't be written to.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> from scipy.io import loadmat
+    >>> from lab.formats.camera_file import default_camera
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "left.mat"
+    ...     _ = write_isetcam(file, default_camera())
+    ...     "sensor" in loadmat(file)
+    True
+    """
     from scipy.io import savemat
 
     with replacing(file) as partial, partial.open("wb") as stream:

@@ -81,8 +81,20 @@ class LensfunLens:
 
 
 def write_lensfun(file: Path, content: CameraFile) -> tuple[str, ...]:
-    """Write the lens of a camera as a lensfun database of one lens. Returns what its laws don't hold. Raises InputError
-    where the camera doesn't say the focal length."""
+    """Write the lens of a camera as a lensfun database of one lens.
+
+    file : XML, to be written
+    content : the camera
+
+    Returns what lensfun's laws don't hold. Raises InputError where the camera doesn't state the focal length.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> from lab.formats.camera_file import default_camera
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = write_lensfun(Path(folder) / "lens.xml", default_camera())
+    ...     'model="poly5"' in (Path(folder) / "lens.xml").read_text()
+    True
+    """
     camera = content.camera
     if camera.lens.focal_length_mm is None:
         raise InputError(f"{content.name}: lens.focal_length_mm is not set; write it into the camera file")
@@ -604,7 +616,21 @@ def _tca(correction: _Correction, terms: FloatArray) -> Callable[[FloatArray], t
 
 def with_lens(content: CameraFile, lens: LensfunLens) -> tuple[CameraFile, tuple[str, ...]]:
     """Return the camera with a lens of lensfun's before it, in place of its own distortion, lateral colour and fall-off
-    of light; and remarks on what it doesn't hold. Raises InputError where the laws make no lens."""
+    of light; and remarks on what it doesn't hold.
+
+    content : the camera
+    lens : as `read_lensfun` returns it
+
+    Raises InputError where the laws make no lens.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> from lab.formats.camera_file import default_camera
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = write_lensfun(Path(folder) / "lens.xml", default_camera())
+    ...     lens = read_lensfun(Path(folder) / "lens.xml", default_camera().camera)
+    >>> with_lens(default_camera(), lens)[0].camera.geometry is None
+    False
+    """
     camera, remarks = content.camera, list(lens.remarks)
     taken: list[type[Effect]] = []
     added: list[Effect] = []

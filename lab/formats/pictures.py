@@ -77,8 +77,19 @@ def picture_facts(file: Path) -> PictureFacts:
 def read_picture(file: Path, page: int | None = None) -> NDArray[Any]:
     """Return the samples of a picture as stored: (rows, cols), or (rows, cols, channels) in the order red, green, blue.
 
-    `page`: which page of a TIFF; None: its only one. Raises InputError, without the path, where the picture is damaged,
-    has several pages and none is chosen, or its codes don't rise with the light."""
+    file : TIFF, PNG, JPEG or another picture
+    page : which page of a TIFF; by default its only one
+
+    Raises InputError, without the path, where the picture is damaged, has several pages and none is chosen, or its
+    codes don't rise with the light.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "flat.tif"
+    ...     tifffile.imwrite(file, np.full((4, 6), 64, np.uint16))
+    ...     read_picture(file).shape
+    (4, 6)
+    """
     if file.suffix.lower() in TIFFS:
         with _open(file) as tif:
             pages = _frames(tif)

@@ -31,10 +31,25 @@ def write_pyxel(
     channel: str = "",
     temperature_c: float | None = None,
 ) -> tuple[str, ...]:
-    """Write Pyxel's YAML for an exposure (s) in which each pixel gets `photons_per_pixel` (mean) at a wavelength (nm).
+    """Write a camera and an exposure as a configuration of Pyxel, which simulates it by independent code.
 
-    `channel`: whose quantum efficiency is taken; by default green's, or the only one's. `temperature_c`: of the sensor,
-    by default that of the dark current's statement. Returns remarks on what Pyxel has no law for; raises InputError.
+    file : YAML, to be written
+    content : the camera
+    exposure_s : s
+    photons_per_pixel : mean
+    wavelength_nm : nm
+    channel : whose quantum efficiency is taken; by default green's, or the only one's
+    temperature_c : of the sensor; by default that of the dark current's statement
+
+    Returns remarks on what Pyxel has no law for. Raises InputError.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> from lab.formats.camera_file import default_camera
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "left.yaml"
+    ...     _ = write_pyxel(file, default_camera(), exposure_s=0.01, photons_per_pixel=1000.0)
+    ...     "quantum_efficiency" in file.read_text()
+    True
     """
     camera = content.camera
     channel = channel or ("Y" if camera.cfa == "MONO" else "G")

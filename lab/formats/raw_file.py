@@ -76,9 +76,23 @@ def replacing(file: Path) -> Iterator[Path]:
 
 
 def write_raw(file: Path, frame: Frame, camera: CameraModel, metadata: RawMetadata) -> None:
-    """Write one frame (rows, cols) of codes; the ending says how: .npy, .tif or .tiff, .dng.
+    """Write one frame of codes; the ending of the file says how: .npy, .tif or .tiff, .dng.
+
+    file : to be written
+    frame : (rows, cols), DN
+    camera : whose frame it is
+    metadata : exposure, gain and names
 
     Raises InputError for another ending, a folder that can't be written to, and a frame that isn't this camera's.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> from lab.formats.camera_file import default_camera
+    >>> camera = default_camera().camera
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "flat.npy"
+    ...     write_raw(file, np.full((camera.rows, camera.cols), 64, np.uint16), camera, RawMetadata(exposure_s=0.01))
+    ...     np.load(file).shape
+    (960, 1280)
     """
     writer = writer_of(file)
     if frame.dtype != np.uint16 or frame.shape != (camera.rows, camera.cols):
@@ -97,7 +111,11 @@ def write_raw(file: Path, frame: Frame, camera: CameraModel, metadata: RawMetada
 
 
 def writer_of(file: Path) -> Callable[[Path, Frame, CameraModel, RawMetadata], None]:
-    """Return the function that writes files of this ending. Raises InputError for an ending that isn't known."""
+    """Return the function that writes files of an ending. Raises InputError for an ending that isn't known.
+
+    >>> callable(writer_of(Path("edge.dng")))
+    True
+    """
     known = {".npy": _write_npy, ".tif": _write_tiff, ".tiff": _write_tiff, ".dng": _write_dng}
     if file.suffix.lower() not in known:
         raise InputError(
@@ -228,7 +246,17 @@ def _colour_matrix(efficiency: tuple[Spectrum, ...]) -> FloatArray:
 
 
 def electrons_of(light: Spectrum, efficiency: Spectrum, reflectance: Spectrum | None = None) -> float:
-    """Return a number proportional to the electrons of a channel from `light` (W per nm) that a patch reflects."""
+    """Return a number proportional to the electrons of a channel.
+
+    light : W per nm
+    efficiency : quantum efficiency of the channel
+    reflectance : of the patch that reflects the light; by default 1
+
+    >>> flat = Spectrum(wavelength_nm=(400.0, 700.0), value=(1.0, 1.0))
+    >>> grey = Spectrum(wavelength_nm=(400.0, 700.0), value=(0.18, 0.18))
+    >>> round(electrons_of(flat, flat, grey) / electrons_of(flat, flat), 2)
+    0.18
+    """
     curves = [light, efficiency, *([reflectance] if reflectance is not None else [])]
     wavelength_nm, weight = quadrature(curves)
     seen = photons_from_energy(wavelength_nm, light.at(wavelength_nm)) * efficiency.at(wavelength_nm)

@@ -70,23 +70,23 @@ def exr_lights(file: Path) -> dict[str, SpectralImage]:
     try:
         with OpenEXR.File(str(file), separate_channels=True) as opened:
             parts = [(str(part.name()) if len(opened.parts) > 1 else "", part) for part in opened.parts]
-            found: dict[str, dict[float, NDArray[Any]]] = {}
+            bands_of_light: dict[str, dict[float, NDArray[Any]]] = {}
             named: list[str] = []
             for prefix, part in parts:
                 named += part.channels
                 for light, bands in _bands(part.channels, prefix).items():
-                    found.setdefault(light, {}).update(bands)
+                    bands_of_light.setdefault(light, {}).update(bands)
     except InputError:
         raise
     except Exception as error:
         raise InputError(f"can't be read as OpenEXR ({one_line(error)}); copy it again") from error
-    if not found:
+    if not bands_of_light:
         raise InputError(
             f"has no radiance by wavelength (its channels are {', '.join(named[:6])}); name them S0.550,0nm, ..., as "
             "PBRT writes them, or Radiance.C01 to C31"
         )
     lights = {}
-    for name, bands in found.items():
+    for name, bands in bands_of_light.items():
         wavelength_nm = sorted(bands)
         if len(wavelength_nm) * bands[wavelength_nm[0]].size > MOST_EXR_SAMPLES:
             raise InputError("has more than 4 GiB of samples; cut the scene")
@@ -102,12 +102,12 @@ def exr_lights(file: Path) -> dict[str, SpectralImage]:
 
 def _bands(channels: Mapping[str, Any], prefix: str) -> dict[str, dict[float, NDArray[Any]]]:
     """Light -> wavelength (nm) -> samples, of the channels that hold a radiance."""
-    found: dict[str, dict[float, NDArray[Any]]] = {}
+    bands_of_light: dict[str, dict[float, NDArray[Any]]] = {}
     numbered: dict[str, dict[int, NDArray[Any]]] = {}
     for name, channel in channels.items():
         if match := _BAND.fullmatch(name):
             light = ".".join(part for part in (prefix, match[1]) if part) or "scene"
-            found.setdefault(light, {})[float(match[2].replace(",", "."))] = np.asarray(channel.pixels)
+            bands_of_light.setdefault(light, {})[float(match[2].replace(",", "."))] = np.asarray(channel.pixels)
         elif match := _NUMBERED.fullmatch(name):
             light = ".".join(part for part in (prefix, match[1]) if part) or "scene"
             numbered.setdefault(light, {})[int(match[2])] = np.asarray(channel.pixels)
@@ -115,8 +115,8 @@ def _bands(channels: Mapping[str, Any], prefix: str) -> dict[str, dict[float, ND
         if len(bands) not in _NUMBERED_NM or sorted(bands) != list(range(1, len(bands) + 1)):
             raise InputError(f"light {light} has {len(bands)} numbered channels, not 31 or 16 from C01")
         grid = np.linspace(*_NUMBERED_NM[len(bands)], len(bands))
-        found[light] = {float(nm): bands[number] for number, nm in enumerate(grid, start=1)}
-    return found
+        bands_of_light[light] = {float(nm): bands[number] for number, nm in enumerate(grid, start=1)}
+    return bands_of_light
 
 
 #: Default luminance of a perfect white diffuser.
@@ -180,10 +180,10 @@ def _light_curve(file: Path) -> tuple[str, Spectrum]:
         raise InputError(f"can't be read as text ({_reason(error)}); give a CSV in UTF-8") from None
     if file.suffix.lower() not in (".sp", ".ti3"):
         return parse_curve(text, (RADIANCE, PHOTONS, RELATIVE))
-    found = parse_cgats(text)
-    if len(found.spectra) > 1:
-        raise InputError(f"holds {len(found.spectra)} spectra; import it, and name the light's CSV")
-    return RADIANCE if found.quantity == "radiance" else RELATIVE, next(iter(found.spectra.values()))
+    measured = parse_cgats(text)
+    if len(measured.spectra) > 1:
+        raise InputError(f"holds {len(measured.spectra)} spectra; import it, and name the light's CSV")
+    return RADIANCE if measured.quantity == "radiance" else RELATIVE, next(iter(measured.spectra.values()))
 
 
 def light(name: str, luminance_cd_m2: float | None = None) -> Spectrum:
@@ -282,10 +282,10 @@ def scene(
         with _about(file):
             return PictureOnScreen.choose(parameters).show(codes, view, white)
     if suffix in CUBES:
-        weights, own = _weights(suffix, parameters or {})
+        weights, chosen = _weights(suffix, parameters or {})
         image = read_cube(file, white, weights)
         with _about(file):
-            return Cube.choose(own).show(image, view)
+            return Cube.choose(chosen).show(image, view)
     raise InputError(
         f"scene {name!r} is not known: name one of {', '.join(scenes())}, a picture ({' '.join(PICTURES)}) or a cube "
         f"({' '.join(CUBES)})"

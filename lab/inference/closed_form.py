@@ -17,7 +17,14 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
-from lab.inference.hypotheses import DEGREES, Coordinate, Hypothesis, SetPrior, symmetric
+from lab.inference.hypotheses import (
+    Coordinate,
+    Hypothesis,
+    SetPrior,
+    log_size_prior,
+    size_precision,
+    symmetric,
+)
 from lab.inference.laplace import integrate
 from lab.inference.model import Model, ScaleIntegral
 from sim.spectrum import FloatArray
@@ -30,7 +37,7 @@ STRONG = 6.0
 #: Largest signal of several amplitudes that are integrated one after the other, in standard deviations.
 _WEAK = 3.0
 #: Points of a table of one amplitude's log odds over z, and of its size.
-_TABLE, _SIZES = 17, 48
+_TABLE, _SIZES = 17, 64
 #: Most steps towards the mode of amplitudes with heavy-tailed priors.
 _MODE_STEPS = 40
 _HERMITE = np.polynomial.hermite_e.hermegauss(9)
@@ -76,8 +83,9 @@ def signatures_of(model: Model, hypotheses: Mapping[str, Hypothesis]) -> tuple[S
                 continue
             points = _merge_opposite(raw, alternative.scales)
             raw = raw[:, [plus for plus, _ in points]]
+            smaller = min((c.smaller for c in hypothesis.coordinates if not c.is_shape), default=1.0)
             coords = tuple(
-                Coordinate("c", alternative.scales[plus], lower=0.0 if minus is None else -np.inf)
+                Coordinate("c", alternative.scales[plus], lower=0.0 if minus is None else -np.inf, smaller=smaller)
                 for plus, minus in points
             )
             columns = tuple(range(at, at + raw.shape[1]))
@@ -123,15 +131,15 @@ def integrate_set(z: FloatArray, gram: FloatArray, members: Sequence[Signature])
     coords = [c for s in members for c in s.coordinates]
     a, b = gram[np.ix_(own, own)], z[own]
     low = np.array([c.lower for c in coords])
-    scale = np.array([c.scale for c in coords])
+    scale, smaller = np.array([c.scale for c in coords]), np.array([c.smaller for c in coords])
     whole = np.array([s.is_whole for s in members for _ in s.columns], bool)
     c = whole.astype(float)
     free = np.flatnonzero(~whole)
     for _ in range(_MODE_STEPS):
         before = c.copy()
+        weight = size_precision(c / scale, smaller) / np.square(scale)
         for k in free:
-            weight = (DEGREES + 1.0) / (DEGREES + (c[k] / scale[k]) ** 2) / scale[k] ** 2
-            c[k] = max((b[k] - a[k] @ c + a[k, k] * c[k]) / (a[k, k] + weight), low[k])
+            c[k] = max((b[k] - a[k] @ c + a[k, k] * c[k]) / (a[k, k] + weight[k]), low[k])
         if np.all(np.abs(c - before) < 1e-4 * scale):
             break
     slope = b - a @ c
@@ -148,10 +156,11 @@ def integrate_each(z: FloatArray, gram: FloatArray, signatures: Sequence[Signatu
         coords = [signatures[i].coordinates[0] for i in ones]
         b, a = z[own], np.maximum(gram[own, own], 1e-300)
         low, scale = np.array([c.lower for c in coords]), np.array([c.scale for c in coords])
-        odds = amplitude_log_odds(b, a, scale, np.isfinite(low))
+        smaller = np.array([c.smaller for c in coords])
+        odds = amplitude_log_odds(b, a, scale, np.isfinite(low), smaller)
         mode = np.zeros(len(ones))
         for _ in range(_MODE_STEPS):
-            weight = (DEGREES + 1.0) / (DEGREES + np.square(mode / scale)) / np.square(scale)
+            weight = size_precision(mode / scale, smaller) / np.square(scale)
             before, mode = mode, np.maximum(b / (a + weight), low)
             if np.all(np.abs(mode - before) < 1e-4 * scale):
                 break
@@ -162,31 +171,31 @@ def integrate_each(z: FloatArray, gram: FloatArray, signatures: Sequence[Signatu
     return found
 
 
-def amplitude_log_odds(z: FloatArray, square: FloatArray, scale: FloatArray, positive: np.ndarray) -> FloatArray:
+def amplitude_log_odds(
+    z: FloatArray, square: FloatArray, scale: FloatArray, positive: np.ndarray, smaller: FloatArray
+) -> FloatArray:
     """Return the log evidence ratios log integral exp(z c - square c^2 / 2) p(c) dc of single amplitudes, all (m,).
 
-    p is Student's t of this scale, of c > 0 where `positive`. In x = c sqrt(square) the data's part has unit width; its
-    points lie closer towards 0, where the prior may be narrower. Amplitudes above `STRONG` standard deviations are
-    integrated about the data's mode, which the prior bends little."""
+    p is the prior of sizes (`log_size_prior`) of this scale, of c > 0 where `positive`. In x = c sqrt(square) the
+    data's part has unit width; its points lie closer towards 0, where the prior may be narrower. Amplitudes above
+    `STRONG` standard deviations are integrated about the data's mode, which the prior bends little."""
     root = np.sqrt(np.maximum(square, 1e-300))
     signal, width = z / root, scale * root
     size = np.abs(signal)
     strong = np.where(positive, signal, size) > STRONG
-    x, weight = _sizes(np.minimum(width, 1.0 / np.maximum(size, 1.0)), np.where(strong, size - _BEYOND, STRONG + 6.0))
-    fall = _log_student(x / width[:, None]) - np.log(width)[:, None] + np.log(weight) - 0.5 * x * x
+    least = np.minimum(width * smaller, 1.0 / np.maximum(size, 1.0))
+    x, weight = _sizes(least, np.where(strong, size - _BEYOND, STRONG + 6.0))
+    prior = log_size_prior(x / width[:, None], smaller[:, None])
+    fall = prior - np.log(width)[:, None] + np.log(weight) - 0.5 * x * x
     odds = logsumexp(fall + signal[:, None] * x, axis=1)
     odds = np.where(positive, odds + np.log(2.0), np.logaddexp(odds, logsumexp(fall - signal[:, None] * x, axis=1)))
     if strong.any():
         about = size[strong, None] + _HERMITE[0]
-        peak = logsumexp(_log_student(about / width[strong, None]) + np.log(_HERMITE[1]), axis=1)
+        prior = log_size_prior(about / width[strong, None], smaller[strong, None])
+        peak = logsumexp(prior + np.log(_HERMITE[1]), axis=1)
         peak += 0.5 * np.square(size[strong]) - np.log(width[strong]) + 0.5 * np.log(2.0 * np.pi)
         odds[strong] = np.logaddexp(odds[strong], peak + np.where(positive[strong], np.log(2.0), 0.0))
     return np.asarray(odds)
-
-
-def _log_student(t: FloatArray) -> FloatArray:
-    """Log density of Student's t with three degrees of freedom."""
-    return np.asarray(np.log(2.0 / (np.pi * np.sqrt(3.0))) - 2.0 * np.log1p(np.square(t) / 3.0))
 
 
 def _sizes(least: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -205,7 +214,7 @@ def signature_log_odds(z: FloatArray, gram: FloatArray, signatures: Sequence[Sig
     at their bound; of those with strong ones, all together (`integrate_set`)."""
     found = np.zeros(len(signatures))
     signal = np.abs(z) / np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    parts: list[tuple[int, float, float, float, bool]] = []
+    parts: list[tuple[int, float, float, float, bool, float]] = []
     for i, s in enumerate(signatures):
         own = list(s.columns)
         if s.is_whole:
@@ -217,14 +226,14 @@ def signature_log_odds(z: FloatArray, gram: FloatArray, signatures: Sequence[Sig
         b, a = z[own], gram[np.ix_(own, own)]
         for k, c in enumerate(s.coordinates):
             positive = bool(np.isfinite(c.lower))
-            parts.append((i, b[k], max(a[k, k], 1e-9 * gram[own[k], own[k]]), c.scale, positive))
+            parts.append((i, b[k], max(a[k, k], 1e-9 * gram[own[k], own[k]]), c.scale, positive, c.smaller))
             curvature = a[k, k] + c.scale**-2.0
             if k + 1 < len(own) and not (positive and b[k] <= 0.0):
                 share = a[k] / curvature
                 b, a = b - share * b[k], a - share[:, None] * a[k]
     if parts:
-        index, left, square, scale, positives = (np.array(column) for column in zip(*parts, strict=True))
-        np.add.at(found, index, amplitude_log_odds(left, square, scale, positives))
+        index, left, square, scale, positives, smaller = (np.array(column) for column in zip(*parts, strict=True))
+        np.add.at(found, index, amplitude_log_odds(left, square, scale, positives, smaller))
     return found
 
 
@@ -234,8 +243,9 @@ def log_odds_of_draws(z: FloatArray, square: float, coordinate: Coordinate) -> F
     nodes = np.linspace(z.min(), z.max(), _TABLE)
     root = float(np.sqrt(max(square, 1e-300)))
     width, end = coordinate.scale * root, 6.0 + float(np.abs(nodes).max()) / root
-    x, weight = _sizes(np.array([min(width, 0.2)]), np.array([end]))
-    fall = (_log_student(x / width) - np.log(width) + np.log(weight) - 0.5 * x * x)[0]
+    x, weight = _sizes(np.array([min(width * coordinate.smaller, 0.2)]), np.array([end]))
+    prior = log_size_prior(x / width, np.asarray(coordinate.smaller))
+    fall = (prior - np.log(width) + np.log(weight) - 0.5 * x * x)[0]
     exponent = fall + nodes[:, None] / root * x
     if not np.isfinite(coordinate.lower):
         exponent = np.concatenate([exponent, fall - nodes[:, None] / root * x], axis=1) - np.log(2.0)

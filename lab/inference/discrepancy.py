@@ -511,6 +511,21 @@ def _on_observables(model: MeasurementModel, names: Sequence[str], used: int) ->
         yield _Columns(own, factor, curve, MOST_ON_OBSERVABLE)
 
 
+def law_error(block: Observable, kernel: FloatArray, change: FloatArray, is_invariant: bool) -> FloatArray:
+    """Return the covariance (n, n) of the error of a law that changes an observable's numbers by `change` (n,), at an
+    error of all of it. It is smooth along the axis (`observable_kernel`) and in the logarithm of the change, of a law
+    that doesn't depend on the axis in that of the change as a share of the scale."""
+    size = np.abs(change) / block.scale if is_invariant else np.abs(change)
+    size = np.log(np.maximum(size, 1e-9 * max(float(size.max()), 1e-300)))
+    alike = kernel * np.exp(-0.5 * np.square(size[:, None] - size))
+    return np.asarray(change[:, None] * alike * change)
+
+
+def depends_not_on_axis(block: Observable, law: type[Effect]) -> bool:
+    """Whether a law doesn't depend on the axis of an observable."""
+    return block.measurement.axis in law.invariances
+
+
 def observable_kernel(*blocks: Observable, is_invariant: bool = False) -> FloatArray:
     """Kernel over the numbers of blocks of one measurement: squared exponential along the axis, 1 of a law that doesn't
     depend on it (`is_invariant`), reduced between channels and between conditions."""

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 from scipy.optimize import lsq_linear
-from scipy.special import erfcx, log_ndtr, logsumexp, ndtr, ndtri
+from scipy.special import log_ndtr, logsumexp, ndtr, ndtri
 from scipy.stats import qmc
 
 from lab.inference.hypotheses import Coordinate
@@ -31,6 +32,8 @@ STEEP, AT_BOUND = 6.0, 0.5
 _FLAT = 1e-4
 #: Points of Gauss-Legendre quadrature along one coordinate; of predictions along one.
 _ALONG, PREDICTED = 48, 9
+#: They are closer to where a prior may be narrow, as sinh(4 t): by a factor of 27.
+_SINH = 4.0
 #: Points of the separation of variables.
 _LATTICE = 9  # 2^9
 
@@ -60,9 +63,9 @@ def integrate(
     )
     free = np.flatnonzero(~pinned)
     log_prior = sum(float(c.log_prior(float(x))) for c, x in zip(coords, u, strict=True))
-    curvature = np.diag(a)[pinned] + precision[pinned]
-    root = np.sqrt(2.0 * np.maximum(curvature, 1e-12 * np.square(pull[pinned])))
-    total = log_prior + float(np.log(np.sqrt(np.pi) / root * erfcx(np.abs(pull[pinned]) / root)).sum())
+    total = log_prior
+    for k in np.flatnonzero(pinned):
+        total += _at_bound(float(a[k, k]), float(b[k]), float(pull[k]), coords[int(k)], float(u[k]))
     mean, covariance = np.zeros(p), np.diag(np.where(pinned, np.square(1.0 / np.where(pull == 0, 1.0, pull)), 0.0))
     if len(free):
         within, mean[free], covariance[np.ix_(free, free)] = _normal(
@@ -95,10 +98,19 @@ def _normal(
     for k, c in enumerate(coords):
         if c.is_shape or skip[k]:
             continue
-        d, weight = _along(float(mean[k]), float(np.sqrt(inverse[k, k])), low[k] - u[k], high[k] - u[k])
-        away = c.log_prior(u[k] + d) - c.log_prior(float(u[k])) - slope[k] * d + 0.5 * precision[k] * d * d
-        total += float(logsumexp(np.minimum(away, 50.0), b=weight))
+        std = float(np.sqrt(inverse[k, k]))
+        d, weight = _along(float(mean[k]), std, low[k] - u[k], high[k] - u[k], split=c.centre - u[k])
+        total += float(logsumexp(np.minimum(_prior_ratio(c, float(u[k]), d), 50.0), b=weight))
     return total, mean, inverse
+
+
+def _at_bound(a: float, b: float, pull: float, c: Coordinate, u: float) -> float:
+    """Log of the integral of exp(b d - a d^2 / 2) p(u + d) / p(u) away from a bound, by quadrature over 40 decay
+    lengths 1 / |pull|, closer at the bound."""
+    start = (c.lower if pull < 0.0 else c.upper) - u
+    d, weight = _closer_at(start, start - np.sign(pull) * min(40.0 / abs(pull), c.upper - c.lower))
+    exponent = b * d - 0.5 * a * d * d + c.log_prior(u + d) - c.log_prior(u)
+    return float(logsumexp(exponent, b=weight))
 
 
 def correct_along(
@@ -111,17 +123,26 @@ def correct_along(
 ) -> float:
     """Return the correction of a log integral by the exact log posterior along coordinate k: the mean, over the cut
     normal distribution of that coordinate, of exact over approximate posterior, the others at their conditional mean
-    within their bounds. Both take d (p,)."""
+    within their bounds. `exact` and `approximate`: log likelihood at d (p,). Their ratio is smooth, and interpolated
+    between few predictions; the prior may be narrow."""
     low, high = bounds(coords)
     std = float(np.sqrt(found.covariance[k, k]))
-    d, weight = _along(float(found.mean[k]), std, low[k] - u[k], high[k] - u[k], PREDICTED)
+    ends = float(found.mean[k]), std, float(low[k] - u[k]), float(high[k] - u[k])
+    at, _ = _along(*ends, PREDICTED)
     ratio = []
-    for one in d:
+    for one in at:
         vector = found.mean + found.covariance[:, k] * (one - found.mean[k]) / std**2
         vector[k] = one
         ratio.append(exact(np.clip(vector, low - u, high - u)) - approximate(vector))
-    top = max(ratio)
-    return top + float(np.log(np.sum(weight * np.exp(np.array(ratio) - top))))
+    d, weight = _along(*ends, split=coords[k].centre - float(u[k]))
+    between = PchipInterpolator(at, ratio)(np.clip(d, at[0], at[-1]))
+    return float(logsumexp(between + np.minimum(_prior_ratio(coords[k], float(u[k]), d), 50.0), b=weight))
+
+
+def _prior_ratio(c: Coordinate, u: float, d: FloatArray) -> FloatArray:
+    """Log of the prior at u + d over that of the expansion about u."""
+    slope, precision = c.slope_and_precision(u)
+    return np.asarray(c.log_prior(u + d) - c.log_prior(u) - slope * d + 0.5 * precision * d * d)
 
 
 def best_within_bounds(
@@ -153,8 +174,10 @@ def bounds(coords: Sequence[Coordinate]) -> tuple[FloatArray, FloatArray]:
     return np.array([c.lower for c in coords]), np.array([c.upper for c in coords])
 
 
-def _along(mean: float, std: float, low: float, high: float, points: int = _ALONG) -> tuple[FloatArray, FloatArray]:
-    """Points and weights of the mean over N(mean, std) cut to [low, high]."""
+def _along(
+    mean: float, std: float, low: float, high: float, points: int = _ALONG, split: float = np.inf
+) -> tuple[FloatArray, FloatArray]:
+    """Points and weights of the mean over N(mean, std) cut to [low, high]. `split`: where points are closer."""
     if mean < low:  # its tail beyond the bound falls as exp(-(d - low) / scale)
         scale = std / max(1.0, (low - mean) / std)
         begin, end = low, min(high, low + 2.0 * FAR * scale)
@@ -164,10 +187,21 @@ def _along(mean: float, std: float, low: float, high: float, points: int = _ALON
     else:
         begin, end = max(low, mean - FAR * std), min(high, mean + FAR * std)
     x, w = _legendre(points)
-    d = 0.5 * (begin + end) + 0.5 * (end - begin) * x
+    d, width = 0.5 * (begin + end) + 0.5 * (end - begin) * x, w
+    if begin <= split <= end:
+        parts = [_closer_at(split, other) for other in (begin, end) if other != split]
+        d, width = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
     density = -0.5 * np.square((d - mean) / std)
-    weight = w * np.exp(density - density.max())
+    weight = width * np.exp(density - density.max())
     return d, weight / weight.sum()
+
+
+def _closer_at(start: float, end: float) -> tuple[FloatArray, FloatArray]:
+    """Points and weights of an integral between `start` and `end`, closer at `start`."""
+    x, w = _legendre(_ALONG)
+    t = _SINH * 0.5 * (x + 1.0)
+    scale = (end - start) / np.sinh(_SINH)
+    return start + scale * np.sinh(t), 0.5 * abs(scale) * _SINH * w * np.cosh(t)
 
 
 def log_box(mean: FloatArray, covariance: FloatArray, low: FloatArray, high: FloatArray) -> float:

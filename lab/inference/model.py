@@ -420,18 +420,18 @@ class ScaleIntegral:
         is_unlisted = np.isin(np.arange(len(self.groups)), list(unlisted))
         return float(np.where(is_unlisted, self.prior_log[1], self.prior_log[0]).sum())
 
-    def weights(self, least: float = 12.0) -> dict[frozenset[int], float]:
+    def weights(self, least: float = 5.0) -> dict[frozenset[int], float]:
         """Log of p(y | A, u) p(u) of no, single and pair flips, and of larger ones about the best. Of flips that are
-        more than `least` below the best it is that with the scales of the others as without; pairs are of groups that
-        aren't, by themselves. The best is extended by what promises most beside it: what a process leaves may be far
-        beyond noise, and yet small beside that process."""
+        more than `least` below the best, and of all but the `REFINED` likeliest, it is that with the scales of the
+        others as without; pairs are of the likeliest groups that aren't, by themselves. The best is extended by what
+        promises most beside it: what a process leaves may be far beyond noise, and yet small beside that process."""
         none: frozenset[int] = frozenset()
         found = {none: self.everyday + self.log_prior(none)}
         roughly = {g: self.everyday + gain + self.log_prior(frozenset((g,))) for g, gain in self._flips[1].items()}
         top = max([found[none], *roughly.values()])
-        for g, value in roughly.items():
-            one = frozenset((g,))
-            found[one] = self.flipped(one) + self.log_prior(one) if value > top - least else value
+        for rank, g in enumerate(sorted(roughly, key=lambda g: -roughly[g])):
+            one, is_near = frozenset((g,)), rank < REFINED and roughly[g] > top - least
+            found[one] = self.flipped(one) + self.log_prior(one) if is_near else roughly[g]
         top = max(found.values())
         near = sorted((s for s in found if len(s) == 1 and found[s] > top - least), key=lambda s: -found[s])[:PAIRED]
         for i, a in enumerate(near):
@@ -461,8 +461,9 @@ class ScaleIntegral:
         return near[:PAIRED]
 
 
-#: Groups of which all pairs are tried, and that are tried beside the best; the most that are unlisted.
-PAIRED, MOST_UNLISTED = 4, 4
+#: Groups of which all pairs are tried, and that are tried beside the best; the most that are unlisted; and those with
+#: which the scales of the others are at their mode again.
+PAIRED, MOST_UNLISTED, REFINED = 4, 4, 8
 
 
 def log_mean(values: FloatArray, shares: FloatArray) -> float:

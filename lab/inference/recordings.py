@@ -19,7 +19,7 @@ from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult, Skipped
 from lab.inference.check import held_out_ids
-from lab.inference.discrepancy import groups_of, observable_kernel
+from lab.inference.discrepancy import depends_not_on_axis, groups_of, law_error, observable_kernel
 from lab.inference.hypotheses import EffectParameter, Hypothesis, SetPrior, effect_at, hypothesis_of, parameters_of
 from lab.inference.model import Group, State
 from lab.inference.search import Search, Table
@@ -119,12 +119,10 @@ class SideModel:
                 own = change[self.measured.slices[index]]
                 if own.any():
                     block = self.measured.blocks[index]
-                    is_invariant = block.measurement.axis in type(effect).invariances
-                    size = np.abs(own) / block.scale if is_invariant else np.abs(own)
-                    size = np.log(np.maximum(size, 1e-9 * size.max()))
-                    alike = self._kernel(index, is_invariant) * np.exp(-0.5 * np.square(size[:, None] - size))
+                    is_invariant = depends_not_on_axis(block, type(effect))
                     error = min(form_scale * effect.form_tolerance, MOST_WRONG) * own
-                    gaussian = gaussian.with_discrepancy(index, error[:, None] * alike * error)
+                    kernel = self._kernel(index, is_invariant)
+                    gaussian = gaussian.with_discrepancy(index, law_error(block, kernel, error, is_invariant))
         return gaussian
 
     def _kernel(self, index: int, is_invariant: bool) -> FloatArray:

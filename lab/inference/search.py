@@ -30,12 +30,12 @@ from lab.inference.closed_form import (
     signatures_of,
 )
 from lab.inference.hypotheses import (
-    DEGREES,
     Coordinate,
     Hypothesis,
     SetPrior,
     coordinates_of,
     moved,
+    size_precision,
     stacked,
     symmetric,
 )
@@ -96,6 +96,9 @@ MOVED, MOST_MOVED = 3.0, 3
 PROMISED = 1.0
 #: Gain of log evidence up to which a size may be near 0, where shapes vanish.
 WEAK = 6.0
+#: Probability that the laws of the likeliest set are inexact from which on others are looked for in the place of its
+#: members, and the most sets that are refitted then.
+DOUBTED, EXCHANGES = 0.5, 2
 #: Log evidence within which two alternatives of one hypothesis are both refitted, and the most that are.
 ALTERNATIVES_NEAR, MOST_ALTERNATIVES = 4.0, 2
 
@@ -304,6 +307,7 @@ class Search:
     fits: dict[frozenset[str], FittedSet] = field(default_factory=dict)
     estimates: dict[frozenset[str], _Estimate] = field(default_factory=dict)
     singles: dict[frozenset[str], dict[str, float]] = field(default_factory=dict)
+    _exchanged: set[frozenset[str]] = field(default_factory=set)  # sets whose members were looked to be exchanged
     _doubtful: int = 0  # refits of sets whose closed form is about a set that fits far worse
 
     @cached_property
@@ -316,10 +320,13 @@ class Search:
         """Fill the table."""
         self._linearise(self.fit({}))
         self._add_strong()
+        self._exchange()
         while len(self.fits) < self.refits:
             less = self._without_one()
             key = self._next() if less is None else None
             if less is None and key is None:
+                if self._exchange():
+                    continue
                 break
             fit = self.fit(less) if less is not None else self._refit_from(self.estimates[key or frozenset()])
             self.report(", ".join(sorted(fit.members)) or "none")
@@ -366,6 +373,70 @@ class Search:
                     self.report(", ".join(sorted(key)))
             if max(self.fits.values(), key=self._log_posterior) is origin:
                 return
+
+    def _exchange(self) -> bool:
+        """Where the laws of the likeliest set are inexact, look for one or two hypotheses in the place of each of its
+        members, in closed form with the others as they are, and refit the best `EXCHANGES`; return whether there was
+        one. About the set without a member the closed forms of the search aren't believed: it fits far worse."""
+        best = max(self.fits.values(), key=self._log_posterior)
+        if best.inexact <= DOUBTED or best.members in self._exchanged:
+            return False
+        self._exchanged.add(best.members)
+        found = [one for name in best.state for one in self._in_place_of(name, best)]
+        found = [one for one in found if frozenset(one[1]) not in self.fits]
+        refitted = False
+        for _, state in sorted(found, key=lambda one: -one[0])[:EXCHANGES]:
+            if len(self.fits) >= self.refits or frozenset(state) in self.fits:
+                continue
+            fit = self.fit(state)
+            refitted = True
+            self.report(", ".join(sorted(fit.members)))
+            if self._log_posterior(fit) > self._top() - FAR_BELOW:
+                self._linearise(fit)
+        return refitted
+
+    def _in_place_of(self, name: str, best: FittedSet) -> list[tuple[float, State]]:
+        """Return sets with one or two others in the place of a member, the likeliest of each number, from where their
+        refits start, with their log posteriors in closed form up to a constant of the set."""
+        rest = {n: p for n, p in best.state.items() if n != name}
+        owners = [n for n, p in best.state.items() for _ in p.u]
+        kept = np.array([owner != name for owner in owners], bool)
+        forms = everyday_forms(self.model.has_form_error(rest))
+        gaussian = self.model.gaussian(rest, forms[len(forms) // 2].share)
+        groups = self.model.groups
+        columns = scaled_columns(groups, best.likeliest.scales.everyday_mode, len(self.model.value))
+        gaussian = with_columns(
+            gaussian, np.column_stack([columns, best.jacobian[:, kept] / np.sqrt(best.precision[kept])])
+        )
+        residual = self.model.value - gaussian.mean
+        white = gaussian.whiten(np.column_stack([self._stack, residual]))
+        upper = dsyrk(1.0, white.T)
+        whole = upper + np.triu(upper, 1).T
+        z, gram = whole[:-1, -1], whole[:-1, :-1]
+        signatures, own = self._signatures, dict[str, list[int]]()
+        for i, s in enumerate(signatures):
+            if s.owner not in best.state:
+                own.setdefault(s.owner, []).append(i)
+        outside = [i for which in own.values() for i in which]
+        if not outside:
+            return []
+        single = dict(zip(outside, integrate_each(z, gram, [signatures[i] for i in outside]), strict=True))
+        shared = {o: -float(np.log(len(which))) for o, which in own.items()}
+        at = gaussian.log_likelihood(self.model.value)
+        found: list[tuple[float, State]] = []
+
+        def add(which: Sequence[int], gain: float, c: Sequence[FloatArray]) -> None:
+            state = self._start(rest, which, c)
+            gain += sum(shared[signatures[i].owner] for i in which)
+            found.append((at + gain + self.prior.log(frozenset(state)), state))
+
+        first = max(outside, key=lambda i: single[i][0])
+        add((first,), single[first][0], (single[first][1],))
+        for _, _, _, one, two in self._rank_pairs(z, gram, single, own, shared)[:TRIPLES]:
+            gain, both = integrate_set(z, gram, [signatures[one], signatures[two]])
+            cut = len(signatures[one].coordinates)
+            add((one, two), gain, (both[:cut], both[cut:]))
+        return found
 
     def _without_one(self) -> State | None:
         """Return the likeliest set without one of its members, from where it stands, if that was never refitted: of all
@@ -434,7 +505,7 @@ class Search:
 
     def _refit_from(self, estimate: _Estimate) -> FittedSet:
         origin = self.fits[estimate.origin]
-        starts = [self._start(origin, estimate.alternatives, estimate.coefficients)]
+        starts = [self._start(origin.state, estimate.alternatives, estimate.coefficients)]
         signatures = self._signatures
         alone = {name: self.fits.get(frozenset((name,))) for name in starts[0]}
         if len(starts[0]) > 1 and all(alone.values()):
@@ -448,7 +519,7 @@ class Search:
         if len(estimate.alternatives) == 1:
             owner = signatures[estimate.alternatives[0]].owner
             for index, c in self._near_alternatives(origin, owner, estimate.alternatives[0]):
-                starts.append(self._start(origin, (index,), (c,)))
+                starts.append(self._start(origin.state, (index,), (c,)))
         found = [self._fit_at(state) for state in starts]
         best = max(found, key=lambda f: f.base)
         modes: list[FittedSet] = []
@@ -486,8 +557,8 @@ class Search:
         places = coordinates_of(self.hypotheses, state)
         return value + sum(float(c.log_prior(float(u))) for (_, _, c), u in zip(places, stacked(state), strict=True))
 
-    def _start(self, origin: FittedSet, which: Sequence[int], coefficients: Sequence[FloatArray]) -> State:
-        state = dict(origin.state)
+    def _start(self, origin: State, which: Sequence[int], coefficients: Sequence[FloatArray]) -> State:
+        state = dict(origin)
         for index, c in zip(which, coefficients, strict=True):
             signature = self._signatures[index]
             hypothesis = self.hypotheses[signature.owner]
@@ -642,16 +713,14 @@ class Search:
         if len(near) != 1:
             return found
         (k,) = near
-        c = coords[k]
-        slope, precision = c.slope_and_precision(float(u[k]))
         at = float(r @ r)
 
         def exact(d: FloatArray) -> float:
             white = gaussian.whiten(self.model.value - self.model.mean(moved(state, u + d)))
-            return -0.5 * (float(white @ white) - at) + float(c.log_prior(u[k] + d[k]) - c.log_prior(float(u[k])))
+            return -0.5 * (float(white @ white) - at)
 
         def approximate(d: FloatArray) -> float:
-            return float(b @ d - 0.5 * d @ a @ d + slope * d[k] - 0.5 * precision * d[k] ** 2)
+            return float(b @ d - 0.5 * d @ a @ d)
 
         plain = integrate(a, b, coords, u, skip=frozenset((k,)))
         more = correct_along(plain, k, coords, u, approximate, exact)
@@ -804,6 +873,26 @@ class Search:
     ) -> list[tuple[float, str, str, int, int]]:  # fmt: skip
         """Estimate all pairs, the best of them one by one; return these, likeliest first."""
         signatures = self._signatures
+        exact = []
+        for rank, (gain, name, other, one, two_) in enumerate(self._rank_pairs(z, gram, single, owners, shared)):
+            value, c = gain, (single[one][1], single[two_][1])
+            if rank < PAIRS:
+                integral, both = integrate_set(z, gram, [signatures[one], signatures[two_]])
+                value = integral + shared[name] + shared[other]
+                cut = len(signatures[one].coordinates)
+                c = (both[:cut], both[cut:])
+                exact.append((value, name, other, one, two_))
+            self._estimate(origin, unlisted, {name, other}, value, (one, two_), c)
+        prior = {n: float(np.log(self.prior.weight[n])) for n in owners}
+        return sorted(exact, key=lambda t: -(t[0] + prior[t[1]] + prior[t[2]]))
+
+    def _rank_pairs(
+        self, z: FloatArray, gram: FloatArray, single: Mapping[int, tuple[float, FloatArray]],
+        owners: Mapping[str, list[int]], shared: Mapping[str, float],
+    ) -> list[tuple[float, str, str, int, int]]:  # fmt: skip
+        """Return all pairs of hypotheses, each by its best signatures, with an estimate of its gain of log evidence,
+        likeliest first."""
+        signatures = self._signatures
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         unit_z, rho = z / size, gram / np.outer(size, size)
         two = np.array([not np.isfinite(c.lower) for s in signatures for c in s.coordinates], bool)
@@ -831,18 +920,7 @@ class Search:
                 gain += shared[name] + shared[other]
                 tried.append((gain, name, other, one, two_))
         prior = {n: float(np.log(self.prior.weight[n])) for n in names}
-        tried.sort(key=lambda t: -(t[0] + prior[t[1]] + prior[t[2]]))
-        exact = []
-        for rank, (gain, name, other, one, two_) in enumerate(tried):
-            value, c = gain, (single[one][1], single[two_][1])
-            if rank < PAIRS:
-                integral, both = integrate_set(z, gram, [signatures[one], signatures[two_]])
-                value = integral + shared[name] + shared[other]
-                cut = len(signatures[one].coordinates)
-                c = (both[:cut], both[cut:])
-                exact.append((value, name, other, one, two_))
-            self._estimate(origin, unlisted, {name, other}, value, (one, two_), c)
-        return sorted(exact, key=lambda t: -(t[0] + prior[t[1]] + prior[t[2]]))
+        return sorted(tried, key=lambda t: -(t[0] + prior[t[1]] + prior[t[2]]))
 
     def _triples(
         self, origin: FittedSet, unlisted: frozenset[int], z: FloatArray, gram: FloatArray,
@@ -1005,7 +1083,8 @@ def _normal_prior(coords: Sequence[Coordinate], u: FloatArray) -> tuple[FloatArr
         elif c.is_shape:
             precision.append(c.scale**-2.0)
         else:
-            precision.append((DEGREES + 1.0) / (DEGREES + ((x - c.centre) / c.scale) ** 2) / c.scale**2)
+            t = np.asarray((x - c.centre) / c.scale)
+            precision.append(float(size_precision(t, np.asarray(c.smaller))) / c.scale**2)
     found = np.array(precision)
     centre = np.array([c.centre if np.isfinite(c.scale) else x for c, x in zip(coords, u, strict=True)])
     return found, found * (centre - u)

@@ -46,7 +46,15 @@ class FrameFigures(Frozen):
 
 
 def frame_figures(frame: NDArray[np.uint16], camera: DataSheet) -> FrameFigures:
-    """Return the figures of `frame` (rows, cols), from one count of the codes of each channel."""
+    """Return histogram, mean and saturated share of each plane of a frame: R, G1, G2 and B of a Bayer mosaic.
+
+    frame : (rows, cols), DN
+    camera : its data sheet
+
+    >>> sheet = DataSheet(rows=4, cols=4, cfa="RGGB", bit_depth=12)
+    >>> [figures.mean_dn for figures in frame_figures(np.full((4, 4), 100, np.uint16), sheet).channels]
+    [100.0, 100.0, 100.0, 100.0]
+    """
     top = camera.saturation_dn
     bin_dn = (top + 1.0) / BINS
     curves = []

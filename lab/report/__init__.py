@@ -18,7 +18,7 @@ from lab.effect_titles import at_beginning, effect_title
 from lab.errors import cannot_write
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
-from lab.formats.recording_set.manifest import told
+from lab.formats.recording_set.manifest import format_setting
 from lab.formats.result_file import Provenance, installed_versions, provenance_of
 from lab.formats.results import (
     Check,
@@ -145,7 +145,7 @@ def page_environment() -> jinja2.Environment:
         trim_blocks=True,
     )
 
-    def stated(value: float | None, unit: str) -> str:
+    def format_stated(value: float | None, unit: str) -> str:
         return "" if value is None else format_value(value, None, unit)
 
     environment.filters |= {
@@ -155,10 +155,10 @@ def page_environment() -> jinja2.Environment:
         "at_beginning": at_beginning,
         "parameter_name": words.parameter_name,
         "parameter_value": words.parameter_value,
-        "stated": stated,
+        "stated": format_stated,
         "stated_as": lambda value, std, unit: "–" if value is None else format_value(value, std, unit),
         "still": still,
-        "setting": told,
+        "setting": format_setting,
         "mood": diagnosis_page.mood,
     }
     return environment

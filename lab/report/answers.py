@@ -67,7 +67,11 @@ def _from_zero(value: ParameterValue, quantity: Quantity | None) -> str:
 
 def odds(diagnosis: DiagnosisResult | None) -> list[tuple[Side, list[tuple[str, float]]]]:
     """Return the probabilities of the models by side: the likeliest sets of effects, none further acting, and all the
-    rest; and the rivals, where these aren't among the sets."""
+    rest; and the rivals, where these aren't among the sets.
+
+    >>> odds(None)
+    []
+    """
     likeliest_sets = []
     for models in diagnosis.models if diagnosis is not None else ():
         shown = models.sets[:ODDS]
@@ -328,7 +332,11 @@ def proofs(fit: FitResult, diagnosis: DiagnosisResult | None, both: BothModels |
 
 
 def strip(fit: FitResult) -> list[tuple[str, list[KeyFigure]]]:
-    """Return the key figures of the first screen: by side, then those of the stereo pair."""
+    """Return the key figures of the first screen: by side, then those of the stereo pair.
+
+    >>> strip(FitResult(source="my-camera", cameras={}))
+    []
+    """
     rows = [
         (
             str(side),

@@ -155,7 +155,16 @@ def band(
 
 
 def photon_transfer(noise: NoiseFit) -> Figure | None:
-    """Draw temporal variance against signal, with the line of the fitted conversion gain."""
+    """Draw temporal variance against signal, with the line of the fitted conversion gain.
+
+    noise : the fit of one camera
+
+    Returns None where it has no points.
+
+    >>> from lab.formats.results import NoiseFit
+    >>> photon_transfer(NoiseFit()) is None
+    True
+    """
     if noise.photon_transfer is None:
         return None
     return photon_transfer_points(
@@ -164,7 +173,17 @@ def photon_transfer(noise: NoiseFit) -> Figure | None:
 
 
 def photon_transfer_points(points: PhotonTransfer, gain: float | None = None, gain_std: float | None = None) -> Figure:
-    """Return temporal variance against signal, with the line of a conversion gain (DN/e) where it is given."""
+    """Draw temporal variance against signal, with the line of a conversion gain where it is given.
+
+    points : of the photon transfer
+    gain, gain_std : DN/e
+
+    >>> from lab.formats.results.fit import PhotonTransfer
+    >>> level = PhotonTransfer(channel=("G",), exposure_s=(0.01,), signal_dn=(100.0,), signal_dn_std=(0.1,),
+    ...     variance_dn2=(50.0,), variance_dn2_std=(0.5,), used=(True,), linearity_residual_percent=(None,))
+    >>> [trace["name"] for trace in photon_transfer_points(level, 0.5)["data"] if "slope" in trace.get("name", "")]
+    ['slope 0.5 DN/e']
+    """
     data: list[Trace] = []
     for channel in dict.fromkeys(points.channel):
         for used in (True, False):
@@ -241,7 +260,16 @@ def repeat_drift(drift: RepeatDrift) -> Figure:
 
 
 def linearity(noise: NoiseFit) -> Figure | None:
-    """Draw the deviation from the straight line of the response, per cent of the line."""
+    """Draw the deviation from the straight line of the response, per cent of the line.
+
+    noise : the fit of one camera
+
+    Returns None where it has no points.
+
+    >>> from lab.formats.results import NoiseFit
+    >>> linearity(NoiseFit()) is None
+    True
+    """
     points = noise.photon_transfer
     if points is None:
         return None
@@ -423,8 +451,14 @@ class Overlay:
 
 
 def overlay_validated(checks: Sequence[tuple[Check, Check | None]]) -> dict[str, list[Overlay]]:
-    """Return panel title -> curves, one panel for each check by a first model and, where there is one, by the improved
-    model."""
+    """Return the curves of checks, by panel title: one panel for each check by a first model and, where there is one,
+    by the improved model.
+
+    checks : (by the first model, by the improved model) of each
+
+    >>> overlay_validated([])
+    {}
+    """
     panels: dict[str, list[Overlay]] = {}
     for check, improved in checks:
         mended = {curve.channel: curve.predicted for curve in improved.curves} if improved is not None else {}
@@ -522,7 +556,16 @@ def transfer_overlays(
 
 
 def mtf_curves(curves: Sequence[MtfCurve]) -> Figure:
-    """Return modulation transfer functions with bands of one standard deviation, spatial frequency in cy/px."""
+    """Return modulation transfer functions with bands of one standard deviation, spatial frequency in cy/px.
+
+    curves : of the slanted edges
+
+    >>> from lab.formats.results import MtfCurve
+    >>> edge = MtfCurve(capture="edge-1", channel="G", angle_deg=5.0, frequency_cy_per_px=(0.0, 0.5), mtf=(1.0, 0.2),
+    ...     mtf_std=(0.0, 0.01), mtf50_cy_per_px=0.31)
+    >>> len(mtf_curves([edge])["data"]) > 0
+    True
+    """
     data: list[Trace] = []
     for curve in curves:
         colour = CHANNEL.get(curve.channel, "#888888")
@@ -544,7 +587,14 @@ def mtf_curves(curves: Sequence[MtfCurve]) -> Figure:
 
 
 def draw_predicted_curves(curves: Sequence[CurveComparison]) -> Figure:
-    """Return measured curves (points with one standard deviation) and their predictions (lines) on one axis."""
+    """Draw measured curves (points with one standard deviation) and their predictions (lines) on one axis.
+
+    >>> from lab.formats.results.validation import CurveComparison
+    >>> curve = CurveComparison(label="edge-1", channel="G", axis="spatial frequency, cy/px", x=(0.0, 0.5),
+    ...     predicted=(1.0, 0.2), measured=(1.0, 0.21), measured_std=(0.01, 0.01))
+    >>> draw_predicted_curves([curve])["layout"]["xaxis"]["title"]["text"]
+    'spatial frequency, cy/px'
+    """
     data: list[Trace] = []
     for curve in curves:
         colour = CHANNEL.get(curve.channel, "#888888")
@@ -562,8 +612,16 @@ def draw_predicted_curves(curves: Sequence[CurveComparison]) -> Figure:
 
 
 def draw_predicted_patches(patches: Sequence[PatchComparison]) -> Figure:
-    """Return predicted against measured signals of a chart's patches, DN above black, by channel; bars: one standard
-    deviation of both together."""
+    """Draw predicted against measured signals of a chart's patches, DN above black, by channel.
+
+    Bars: one standard deviation of prediction and measurement together.
+
+    >>> from lab.formats.results.validation import PatchComparison
+    >>> patch = PatchComparison(patch="white", channel="G", predicted_dn=1000.0, predicted_dn_std=3.0,
+    ...     measured_dn=1010.0, measured_dn_std=4.0)
+    >>> draw_predicted_patches([patch])["data"][1]["error_y"]["array"]
+    [5.0]
+    """
     data: list[Trace] = []
     top = max(max(patch.measured_dn, patch.predicted_dn) for patch in patches)
     line = {"color": "@muted", "width": 1.0, "dash": "dash"}
@@ -588,11 +646,20 @@ def draw_predicted_patches(patches: Sequence[PatchComparison]) -> Figure:
 
 
 def patch_comparison(patches: Sequence[PatchComparison], improved: Sequence[PatchComparison] | None = None) -> Figure:
-    """Return measured and predicted patches on the same axes, a panel for each channel, in per cent of its brightest
+    """Draw measured and predicted patches on the same axes, a panel for each channel, in per cent of its brightest
     measured patch.
 
-    Bars: one standard deviation of measurement and prediction together. `improved`: the same patches by the improved
-    model."""
+    patches : by the first model
+    improved : the same patches by the improved model
+
+    Bars: one standard deviation of measurement and prediction together.
+
+    >>> from lab.formats.results.validation import PatchComparison
+    >>> patch = PatchComparison(patch="white", channel="G", predicted_dn=990.0, predicted_dn_std=3.0,
+    ...     measured_dn=1000.0, measured_dn_std=4.0)
+    >>> patch_comparison([patch])["data"][0]["y"]
+    [99.0]
+    """
     channels = list(dict.fromkeys(patch.channel for patch in patches))
     first = BASELINE if improved is not None else "predicted"
     height, data, axes = 90 + 150 * len(channels), list[Trace](), dict[str, Any]()
@@ -752,7 +819,15 @@ def _beside_residuals(said: str, colour: str, place: int) -> dict[str, Any]:
 
 
 def residual_curve(curve: ResidualCurve) -> Figure:
-    """Draw one measurement with both models' predictions, and below it the residuals in standard deviations."""
+    """Draw one measurement with both models' predictions, and below it the residuals in standard deviations.
+
+    >>> from lab.formats.results.diagnosis import ResidualCurve
+    >>> curve = ResidualCurve(side="left", measurement="slanted_edge", label="edge-1", channel="G",
+    ...     axis="spatial frequency, cy/px", x=(0.1, 0.2), measured=(0.9, 0.8), measured_std=(0.01, 0.01),
+    ...     before=(0.95, 0.85), after=(0.9, 0.8), held_out=True)
+    >>> len(residual_curve(curve)["data"]) >= 3
+    True
+    """
     std = np.maximum(np.asarray(curve.measured_std), 1e-12)
     seen = np.asarray(curve.measured)
     notes: list[dict[str, Any]] = []
@@ -875,7 +950,11 @@ PACKED, PACKED_FROM = frozenset({"x", "y", "z", "array", "arrayminus"}), 8
 
 @cache
 def plotly_base64() -> str:
-    """Return the compressed build as base64; `charts.js` expands it in the page."""
+    """Return the compressed build of Plotly as base64; `charts.js` expands it in the page.
+
+    >>> base64.b64decode(plotly_base64())[:2].hex()  # of gzip
+    '1f8b'
+    """
     return base64.b64encode(BUILD.read_bytes()).decode("ascii")
 
 
@@ -891,8 +970,13 @@ class ChartData:
         return len(self._lines) - 1
 
     def pack(self) -> str:
-        """Return all figures, a line of JSON each, compressed, as base64: no text of theirs can end the element that
+        """Return all figures as base64, a line of JSON each, compressed: no text of theirs can end the element that
         holds it.
+
+        >>> charts = ChartData()
+        >>> _ = charts.add({"data": [], "layout": {}})
+        >>> gzip.decompress(base64.b64decode(charts.pack())).decode()
+        '{"data":[],"layout":{}}'
         """
         return base64.b64encode(gzip.compress("\n".join(self._lines).encode(), mtime=0)).decode("ascii")
 
@@ -914,7 +998,11 @@ def _pack(values: Any) -> dict[str, str] | None:
 
 
 def figure_json(figure: Figure) -> str:
-    """Return a figure as one line of JSON: a trace's numbers as typed arrays, others rounded to 7 digits."""
+    """Return a figure as one line of JSON: a trace's numbers as typed arrays, others rounded to 7 digits.
+
+    >>> figure_json({"data": [], "layout": {"height": 300}})
+    '{"data":[],"layout":{"height":300}}'
+    """
 
     def round_numbers(value: Any, key: str = "") -> Any:
         if key in PACKED and (packed := _pack(value)) is not None:

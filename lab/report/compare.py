@@ -76,7 +76,14 @@ def projection_vectors(item: ProjectionChange) -> Figure:
 
 
 def render_comparison(comparison: ComparisonResult) -> str:
-    """Return the page as HTML text."""
+    """Return the page of a comparison as HTML text, which needs nothing else.
+
+    >>> from lab.fit.compare import compare
+    >>> from lab.formats.results import FitResult
+    >>> fit = FitResult(source="my-camera", cameras={})
+    >>> "</html>" in render_comparison(compare(fit, fit))
+    True
+    """
     number = sum(row.changed for row in comparison.changes) + sum(item.changed for item in comparison.projection)
     total = len(comparison.changes) + len(comparison.projection)
     rows: list[dict[str, Any]] = [

@@ -166,7 +166,14 @@ def mood(chi2: float, n: int) -> str:
 
 def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) -> list[ResidualCurve]:
     """Return the curve of every measurement that the baseline fits worst, of held-out captures where there are any;
-    worst first."""
+    worst first.
+
+    curves : of the diagnosis
+    most : how many at most
+
+    >>> worst_of_each([])
+    []
+    """
 
     def mean_chi2(curve: ResidualCurve) -> float:
         std = np.maximum(np.asarray(curve.measured_std), 1e-12)

@@ -87,7 +87,11 @@ def values_along(data: Sequence[Trace], key: str) -> list[float]:
 
 
 def floats(values: NDArray[np.floating[Any]]) -> list[float]:
-    """Return an array (n,) as a list."""
+    """Return an array (n,) as a list.
+
+    >>> floats(np.array([1.0, 2.0]))
+    [1.0, 2.0]
+    """
     return [float(value) for value in values]
 
 

@@ -57,7 +57,16 @@ class KeyFigure:
 
 
 def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[KeyFigure]:
-    """Yield results of the photon transfer, with the maker's values."""
+    """Yield results of the photon transfer, with the maker's values.
+
+    noise : of one camera
+    camera : its data sheet, for what the maker states
+
+    >>> from lab.formats.results import NoiseFit
+    >>> noise = NoiseFit(read_noise_e=2.0, read_noise_e_std=0.05)
+    >>> [figure.text for figure in noise_figures(noise) if "read noise" in figure.name][0]
+    '2.000 ± 0.050 e'
+    """
     for field, (name, unit) in NOISE.items():
         value = getattr(noise, field)
         if value is None:
@@ -158,8 +167,17 @@ def rotation_vector_mrad(rotation: tuple[tuple[float, float, float], ...]) -> tu
 
 
 def by_side(fit: FitResult, cameras: dict[Side, DataSheet]) -> list[tuple[str, dict[Side, KeyFigure]]]:
-    """Return the rows of the table of key figures: name -> figure of each side, in the order of the first side that has
-    it.
+    """Return the rows of the table of key figures: name and figure of each side, in the order of the first side that
+    has it.
+
+    fit : of all cameras
+    cameras : their data sheets
+
+    >>> from lab.formats.results import CameraFit, NoiseFit
+    >>> camera = CameraFit(noise=NoiseFit(read_noise_e=2.0, read_noise_e_std=0.05))
+    >>> rows = by_side(FitResult(source="my-camera", cameras={"left": camera}), {})
+    >>> [figures["left"].text for name, figures in rows if "read noise" in name]
+    ['2.000 ± 0.050 e']
     """
     names: list[str] = []
     rows: dict[str, dict[Side, KeyFigure]] = {}

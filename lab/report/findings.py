@@ -47,7 +47,7 @@ def _proof(curve: ResidualCurve) -> ProofCurve:
 
 
 def findings(fit: FitResult, validation: ValidationResult | None, diagnosis: DiagnosisResult) -> DiagnosisFindings:
-    """Return what is told of a diagnosis, and of the fit and the validation that go with it."""
+    """Return what the page shows of a diagnosis, and of the fit and the validation that go with it."""
     verdict, _, headline = words.headline(diagnosis)
     shown = [picture for picture in diagnosis.pictures if _explained_share(picture) >= WORTH_A_PICTURE]
     best = {picture.side: picture for picture in sorted(shown, key=_explained_share)}

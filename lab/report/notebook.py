@@ -75,7 +75,12 @@ def _row(kind: str, cells: Sequence[str]) -> str:
 
 
 def text(result: Any) -> str:
-    """Return the summary of a result as lines of text."""
+    """Return the summary of a result as lines of text.
+
+    >>> import calibench
+    >>> text(calibench.FitResult(source="my-camera", cameras={})).splitlines()[0]
+    'Fit of my-camera'
+    """
     shown = summary(result)
     rows = [shown.headings, *shown.rows[:ROWS]] if shown.rows else []
     widths = [max(len(row[k]) for row in rows) for k in range(len(shown.headings))] if rows else []

@@ -45,15 +45,28 @@ def png_data_uri(image: NDArray[np.uint8]) -> str:
 
 
 def photograph_data_uri(image: NDArray[np.uint8]) -> str:
-    """Return an image (rows, cols) or (rows, cols, 3: R, G, B) to look at, not to measure in: a WebP data URI, a tenth
-    of the PNG's size."""
+    """Return an image to look at, not to measure in: a WebP data URI, a tenth of the PNG's size.
+
+    image : (rows, cols) or (rows, cols, 3: R, G, B)
+
+    >>> photograph_data_uri(np.zeros((8, 8), np.uint8))[:15]
+    'data:image/webp'
+    """
     pixels = image if image.ndim == 2 else image[..., ::-1]
     _, data = cv2.imencode(".webp", np.ascontiguousarray(pixels), [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY])
     return "data:image/webp;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
 
 def kernel_picture(kernel: ArrayLike, peak: float, margin: int = 0) -> str:
-    """Return a kernel in colours from 0 to `peak` on a square-root scale, `margin` cells cut off at each border."""
+    """Return a kernel in colours from 0 to `peak` on a square-root scale, as the text of a PNG data URI.
+
+    kernel : (n, n)
+    peak : value of the brightest colour
+    margin : cells that are cut off at each border
+
+    >>> kernel_picture(np.eye(9) / 9.0, 0.2, margin=1)[:14]
+    'data:image/png'
+    """
     values = np.asarray(kernel, float)
     if margin:
         values = values[margin:-margin, margin:-margin]
@@ -84,7 +97,15 @@ def map_picture(values: ArrayLike, width_px: int | None = None) -> tuple[NDArray
 
 
 def difference_picture(difference: ArrayLike, limit: float, margin: int = 0) -> str:
-    """Return a signed difference in blue (-limit) through white (0) to red (+limit)."""
+    """Return a signed difference in blue (-limit) through white (0) to red (+limit), as the text of a PNG data URI.
+
+    difference : (n, n)
+    limit : of the colours
+    margin : cells that are cut off at each border
+
+    >>> difference_picture(np.zeros((9, 9)), 0.1)[:14]
+    'data:image/png'
+    """
     values = np.asarray(difference, float)
     if margin:
         values = values[margin:-margin, margin:-margin]
@@ -119,7 +140,14 @@ def patch_colours(patches: tuple[PatchComparison, ...]) -> dict[str, tuple[str, 
     gamma 2.2.
 
     These are camera colours, not colorimetry. Both get the same balance, so that a difference on the page is one in the
-    recording."""
+    recording.
+
+    >>> from lab.formats.results.validation import PatchComparison
+    >>> white = [PatchComparison(patch="white 9.5 (.05 D)", channel=c, predicted_dn=900.0, predicted_dn_std=1.0,
+    ...     measured_dn=1000.0, measured_dn_std=1.0) for c in "RGB"]
+    >>> len(patch_colours(tuple(white))["white 9.5 (.05 D)"])
+    2
+    """
     measured: dict[str, dict[str, float]] = {}
     predicted: dict[str, dict[str, float]] = {}
     for patch in patches:
@@ -136,8 +164,17 @@ def patch_colours(patches: tuple[PatchComparison, ...]) -> dict[str, tuple[str, 
 
 
 def frame_picture(frame: NDArray[np.uint16], camera: DataSheet, width_px: int = 480) -> str:
-    """Return a frame for display: one pixel per Bayer cell, black subtracted, each channel scaled to its 99.5 %
-    quantile."""
+    """Return a frame for display, as the text of a data URI: one pixel per Bayer cell, black subtracted, each channel
+    scaled to its 99.5 % quantile.
+
+    frame : (rows, cols), DN
+    camera : its data sheet
+    width_px : greatest width
+
+    >>> sheet = DataSheet(rows=8, cols=8, cfa="RGGB", bit_depth=12)
+    >>> frame_picture(np.full((8, 8), 100, np.uint16), sheet)[:11]
+    'data:image/'
+    """
     split: dict[str, Any] = planes(frame.astype(np.float32) - float(camera.black_level_dn or 0.0), camera.cfa)
     if camera.cfa == "MONO":
         colours = np.stack([split["Y"]] * 3, axis=-1)

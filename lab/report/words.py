@@ -28,20 +28,32 @@ VERDICTS = {
 
 
 def headline(diagnosis: DiagnosisResult | None) -> tuple[str, str, str]:
-    """Return (badge, mood, sentence) of a diagnosis, or of none."""
+    """Return (badge, CSS class, sentence) of a diagnosis, or of none.
+
+    >>> headline(None)[0]
+    'not diagnosed'
+    """
     if diagnosis is None:
         return "not diagnosed", "open", "The recordings were calibrated; they were not diagnosed."
     return VERDICTS[diagnosis.verdict]
 
 
 def parameter_name(name: str, value: ParameterValue) -> str:
-    """Return a parameter's name as words, without the unit at its end: `displacement_x_um` is `displacement x`."""
+    """Return a parameter's name as words, without the unit at its end.
+
+    >>> parameter_name("displacement_x_um", ParameterValue(value=2.1, std=0.05, unit="um"))
+    'displacement x'
+    """
     unit = "percent" if value.unit == "%" else value.unit
     return name.removesuffix(f"_{unit}").replace("_", " ")
 
 
 def parameter_value(value: ParameterValue) -> str:
-    """Return a parameter's value with its uncertainty; and that its size isn't determined, where it isn't."""
+    """Return a parameter's value with its uncertainty; and that its size isn't determined, where it isn't.
+
+    >>> parameter_value(ParameterValue(value=2.1, std=0.05, unit="um"))
+    '2.100 ± 0.050 µm'
+    """
     text = format_value(value.value, value.std, value.unit, value.shown_interval)
     return text if value.is_determined else f"{text}, not determined"
 

@@ -159,8 +159,15 @@ def parse_uses(text: str) -> tuple[str, ...]:
 def budget(
     content: CameraFile, uses: tuple[str, ...], station: Station | None = None, times: StepTimes | None = None
 ) -> BudgetResult:
-    """Return the budget of every use, and with a `station` what its sequences would make of it, at the step `times`
-    that are known there. Raises InputError where the model states no uncertainties."""
+    """Return the budget of every use: the contributions of effects and parameters to the variance of its numbers.
+
+    content : a camera model with uncertainties
+    uses : names of `USES`
+    station : whose sequences are weighed by what each would reduce
+    times : how long the station's steps took, where that is known
+
+    Raises InputError where the model states no uncertainties.
+    """
     posterior = with_darks(posterior_of(content), content.camera)
     content = replace(content, effects=with_unnamed(content.effects, posterior))
     covariance = np.array(posterior.covariance)
@@ -174,7 +181,7 @@ def budget(
 
 
 def with_darks(posterior: ModelPosterior, camera: CameraModel) -> ModelPosterior:
-    """Return a posterior with what dark frames tell of the read noise beside it: a diagnosis knows that by the photon
+    """Return a posterior to which dark frames add their read noise: a diagnosis knows that by the photon
     transfer's intercept alone. Two frames of N pixels measure the dark's variance to sqrt(2 / N), and to
     `DARK_VARIANCE_FLOOR`."""
     if "read" not in posterior.names:

@@ -169,7 +169,12 @@ def reference_temperature_c(content: CameraFile) -> float | None:
 
 
 def has_dark_law(content: CameraFile) -> bool:
-    """Return whether the model says how dark current changes with temperature."""
+    """Return whether the model states how dark current changes with temperature.
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> has_dark_law(default_camera())
+    True
+    """
     acts = any(isinstance(e, DarkCurrentTemperature) and e.doublings_per_c != 0.0 for e in content.effects)
     return acts or content.camera.dark_current_doubling_c is not None
 

@@ -99,7 +99,15 @@ def predict(
 
 def posterior_of(content: CameraFile) -> ModelPosterior:
     """Return how well the model's parameters are known: its posterior, else one of independent parameters by the
-    camera's `std`. Raises InputError where it states neither."""
+    camera's `std`. Raises InputError where it states neither.
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> try:
+    ...     posterior_of(default_camera())
+    ... except InputError as error:
+    ...     print("no uncertainties" in str(error))
+    True
+    """
     if content.posterior is not None:
         return content.posterior
     camera = content.camera
@@ -398,16 +406,20 @@ def _hold_what_is_corrected(
 
 
 def correction_covariance(correction: ModelDiscrepancy, x: FloatArray) -> FloatArray:
-    """Return the covariance (n, n) of what a correction's factor is wrong by at places `x` (n,) of its axis: its
-    factors scatter from place to place, and drift, and both go on between and beyond them.
+    """Return the covariance (n, n) of what a correction's factor is wrong by.
 
-    With g(d) half the mean squared difference of factors that are d apart, c + b d by least squares, and w (n, k) the
-    weights by which the correction is drawn through its k factors, the error f - w f_k has the covariance
+    correction : with factors at k places of its axis
+    x : places (n,) for which it is wanted
+
+    Its factors scatter from place to place, and drift, and both go on between and beyond them. With g(d) half the mean
+    squared difference of factors that are d apart, c + b d by least squares, and w (n, k) the weights by which the
+    correction is drawn through its k factors, the error f - w f_k has the covariance
 
         w g(k, n) + g(n, k) w' - g(n, n) - w g(k, k) w'
 
     (N. Cressie, Statistics for Spatial Data, 1993, section 3.1). Every place departs by itself: none of the session to
-    come is one of those that were fitted."""
+    come is one of those that were fitted.
+    """
     at = np.array(correction.at)
     lag, half = np.abs(np.subtract.outer(at, at)), 0.5 * np.subtract.outer(correction.factor, correction.factor) ** 2
     near = np.triu(lag <= 0.5 * np.ptp(at), 1)

@@ -140,7 +140,11 @@ class TwinScore(Tabular, Frozen):
 
 def conclusion(effects: Sequence[TestedEffect]) -> str:
     """Return what is named of one camera after its tests, in a line: names that stand, those that were withdrawn, and
-    those that the session doesn't test."""
+    those that the session doesn't test.
+
+    >>> conclusion([])
+    'stands: no name'
+    """
 
     def join_names(*verdicts: TwinVerdict) -> str:
         mine = [effect for effect in effects if effect.verdict in verdicts]

@@ -113,7 +113,18 @@ def seal_path(file: Path) -> Path:
 
 
 def seal(prediction: SealedPrediction, file: Path) -> str:
-    """Write a prediction and its hash; returns the hash (hexadecimal)."""
+    """Write a prediction as JSON, and its SHA-256 beside it; return the SHA-256 (hexadecimal).
+
+    prediction : to be sealed before the session is captured
+    file : JSON, to be written
+
+    >>> from tempfile import TemporaryDirectory
+    >>> prediction = SealedPrediction(model="left.toml", plan="my-plan", changes=Changes(), sides={}, cameras={})
+    >>> with TemporaryDirectory() as folder:
+    ...     digest = seal(prediction, Path(folder) / "prediction.json")
+    ...     open_seal(Path(folder) / "prediction.json", digest).plan
+    'my-plan'
+    """
     text = (
         json.dumps(prediction.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), ensure_ascii=True) + "\n"
     )

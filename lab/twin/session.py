@@ -73,7 +73,17 @@ def future_session(
 
 
 def check_sensor(content: CameraFile, stated: DataSheet, source: str) -> None:
-    """Raises InputError where the plan's camera isn't the model's."""
+    """Check that the plan's camera is the model's. Raises InputError where a property of the sensor differs.
+
+    content : the model
+    stated : data sheet of the plan
+    source : of the plan, for the message
+
+    >>> from lab.formats.camera_file import default_camera
+    >>> camera = default_camera()
+    >>> sheet = DataSheet.model_validate({name: getattr(camera.camera, name) for name in SENSOR})
+    >>> check_sensor(camera, sheet, "my-plan")
+    """
     for name in SENSOR:
         if getattr(stated, name) != getattr(content.camera, name):
             raise InputError(
@@ -83,7 +93,12 @@ def check_sensor(content: CameraFile, stated: DataSheet, source: str) -> None:
 
 
 def light_path(capture: Capture) -> str | None:
-    """Return the file of the light before the camera; None in the dark, and where it isn't stated."""
+    """Return the file of the light before the camera; None in the dark, and where it isn't stated.
+
+    >>> from lab.capture_kinds.dark import DarkCapture
+    >>> light_path(DarkCapture(kind="dark", id="dark-1", side="left", frame="dark-1.npy", exposure_s=0.1)) is None
+    True
+    """
     return getattr(capture, "radiance", None) or getattr(capture, "light_radiance", None)
 
 

@@ -32,6 +32,7 @@ class ChargeTransferInefficiency(Effect):
     fast and each packet fills the traps to its own level, all that it finds is what the one before has left, whatever
     their release: the noise of that one goes to the next alone (Massey et al., section 2), unless that is so faint that
     the traps, which kept b = exp(-1 / tau) of the one before, hold more than it would fill: it takes none then.
+    Overscan reads loss x transfers x signal of even light in all lines together.
 
     `capture`: losses of many transfers act one after the other, or those of all at once, as models of many transfers
     have it that don't follow each of them (Short et al.): the same for few transfers, less for many.

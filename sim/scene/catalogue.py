@@ -20,7 +20,7 @@ from sim.camera import CameraModel, Geometry
 from sim.extensions import refuse
 from sim.parameters import Frozen, Quantity, read_quantities
 from sim.scene import colorchecker
-from sim.scene.chart import Chart, added_charts
+from sim.scene.chart import PatchChart, added_charts
 from sim.scene.light import luminance_cd_m2, screen
 from sim.scene.scenes import (
     EdgeRegion,
@@ -432,7 +432,7 @@ def scenes() -> dict[str, type[NamedScene]]:
     return found
 
 
-def _scene_of(chart_name: str, added: Chart) -> type[NamedScene]:
+def _scene_of(chart_name: str, added: PatchChart) -> type[NamedScene]:
     class AddedChart(_Chart):
         name: ClassVar[str] = chart_name
         shows: ClassVar[str] = added.shows

@@ -13,7 +13,7 @@ from sim.spectrum import Spectrum
 FIRST_NM, LAST_NM = 380.0, 730.0
 
 
-class Chart:
+class PatchChart:
     """A flat chart of diffuse patches in even rows and columns, on a matt black frame of 3 % reflectance.
 
     shows : what it is, in a few words
@@ -24,7 +24,7 @@ class Chart:
 
     Raises ValueError, in one line, where these don't agree.
 
-    >>> chart = Chart("a grey card", 1, 1, {"grey": Spectrum.of([380.0, 730.0], [0.2, 0.2])})
+    >>> chart = PatchChart("a grey card", 1, 1, {"grey": Spectrum.of([380.0, 730.0], [0.2, 0.2])})
     >>> float(chart.reflectances["grey"].at(1000.0))
     0.2
     """
@@ -65,12 +65,12 @@ def _hold_ends(patch: str, curve: Spectrum) -> Spectrum:
 
 
 @cache
-def added_charts() -> dict[str, Chart]:
-    """Return the charts of other packages, by name: entry points of `calibench.charts` that are a `Chart`."""
+def added_charts() -> dict[str, PatchChart]:
+    """Return the charts of other packages, by name: entry points of `calibench.charts` that are a `PatchChart`."""
     charts = {}
     for name, chart in extensions("charts"):
-        if isinstance(chart, Chart):
+        if isinstance(chart, PatchChart):
             charts[name] = chart
         else:
-            refuse("charts", name, f"{chart!r} is no sim.scene.chart.Chart")
+            refuse("charts", name, f"{chart!r} is no sim.scene.chart.PatchChart")
     return charts

@@ -12,7 +12,7 @@ from sim.camera import CameraModel, Lens
 from sim.frame import Exposure, expected_electrons
 from sim.optics.illumination import relative_illumination
 from sim.scene.catalogue import scene_by_name
-from sim.scene.chart import Chart
+from sim.scene.chart import PatchChart
 from sim.scene.scenes import ReflectanceChart
 from sim.scene.warp import Warp
 from sim.spectrum import Spectrum
@@ -27,7 +27,7 @@ EXPOSURE_S = 0.01
 LARGEST_DIFFERENCE = 5e-3
 
 
-def _camera(chart: Chart) -> CameraModel:
+def _camera(chart: PatchChart) -> CameraModel:
     flat = Spectrum.of([300.0, 1100.0], [0.5, 0.5])
     return CameraModel(
         rows=PX * (chart.rows + 1), cols=PX * (chart.cols + 1), pixel_pitch_um=20.0, fill_factor=1.0, cfa="MONO",
@@ -37,7 +37,7 @@ def _camera(chart: Chart) -> CameraModel:
     )  # fmt: skip
 
 
-def complaints(name: str, chart: Chart) -> tuple[str, ...]:
+def complaints(name: str, chart: PatchChart) -> tuple[str, ...]:
     """Return what of the contract an installed chart doesn't keep, a line each.
 
     name : of its entry point
@@ -45,7 +45,7 @@ def complaints(name: str, chart: Chart) -> tuple[str, ...]:
     return tuple(_complaints(name, chart))
 
 
-def _complaints(name: str, chart: Chart) -> Iterator[str]:
+def _complaints(name: str, chart: PatchChart) -> Iterator[str]:
     camera = _camera(chart)
     scene = scene_by_name(name, camera, WHITE, parameters={"fill": 1.0})
     assert isinstance(scene, ReflectanceChart)

@@ -21,6 +21,7 @@ from scipy.ndimage import convolve, convolve1d
 from scipy.special import ndtr, ndtri
 
 from sim.camera import CameraModel, Cfa
+from sim.sensor.margins import Margins
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray
 
@@ -140,6 +141,11 @@ class FixedPattern:
     def single_dsnu_e(self) -> Float32Array:
         """`dsnu_e` in single precision, as frames are drawn."""
         return self.dsnu_e.astype(np.float32)
+
+    def surrounded(self, margins: Margins) -> FixedPattern:
+        """Return the pattern of frames with margins, whose pixels are all alike."""
+        column_e = None if self.column_e is None else np.pad(self.column_e, margins.lines[1])
+        return FixedPattern(margins.surround(self.prnu), margins.surround(self.dsnu_e), column_e)
 
     @classmethod
     def draw(cls, camera: CameraModel, rng: np.random.Generator) -> Self:

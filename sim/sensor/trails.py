@@ -41,6 +41,11 @@ class Trails:
     `at_once`: the traps of n transfers fill to g N of N electrons that are left, g = n loss / b, and keep n loss / (1 +
     g) of the packet; what they release finds them full: 1 + n loss / (1 + g) (T - 1). It is the model of A. Short et
     al., MNRAS 430 (2013) 3078, of the same loss for few transfers, less for many.
+
+    Within the active area each packet finds empty traps. Behind it, traps hold what packets have filled them to: that
+    of one of equal packets, not the sum, so that a margin behind even light reads n loss N in all, the deferred charge
+    by which the extended pixel edge response defines the inefficiency (Janesick, section 5.2.2). The law of the active
+    area alone would read n loss N / (1 - b), and takes the share loss b / (1 - b) too much of even light.
     """
 
     axis: Literal[0, 1]
@@ -61,21 +66,32 @@ class Trails:
             species.append((np.asarray(lost / (1.0 + lost / held)), held))
         return species
 
-    def clock(self, electrons: FloatArray) -> FloatArray:
+    def clock(self, electrons: FloatArray, margins: tuple[int, int] = (0, 0)) -> FloatArray:
         """Return the mean electrons (rows, cols) that are read, given those in the pixels.
 
         exp(n loss (T - 1)) of each source line by its own n, as the series of (T - 1)^m of n^m loss^m / m! times the
         source. What is released behind the last line isn't in the frame.
+
+        margins : lines before the first active one and behind the last one (`Margins.lines`). Transfers are counted
+            from the first active line on, so that the active area is read as it would be without them
         """
         packets = np.moveaxis(electrons, self.axis, 0)
+        ahead, behind = margins
         if self.output == "last":
-            packets = packets[::-1]
-        transfers = np.arange(1.0, len(packets) + 1.0)[:, None]
+            packets, ahead, behind = packets[::-1], behind, ahead
+        transfers = np.maximum(np.arange(1.0, len(packets) + 1.0) - ahead, 0.0)[:, None]
+        read = self._clock_in_order(packets, transfers)
+        if behind:
+            read = np.concatenate([read[:-behind], self._read_behind(packets, transfers, behind)])
+        return self._as_given(read)
+
+    def _clock_in_order(self, packets: FloatArray, transfers: FloatArray) -> FloatArray:
+        """Return what is read of packets (lines, n) in the order of their transfers (lines, 1)."""
         if self.at_once:
             read = packets
             for kept, held in self._retain_at_once(transfers):
                 read = read + _release(kept * packets, held) - kept * packets
-            return self._as_given(read)
+            return read
         lost = self.loss * transfers
         terms, size = 1, 2.0 * float(lost[-1, 0])
         while size > LEAST_TERM:
@@ -87,7 +103,26 @@ class Trails:
         read = sources.pop()
         while sources:
             read = sources.pop() + self._delay(read) - read
-        return self._as_given(read)
+        return read
+
+    def _read_behind(self, packets: FloatArray, transfers: FloatArray, behind: int) -> FloatArray:
+        """Return what is read of the `behind` last lines of packets (lines, n), where each packet has filled the traps
+        to its own level: n loss N, the most of all packets by what is left of it. Where all transfers act at once, a
+        packet N after traps that hold k of the one before fills them to g (N + k) / (1 + g)."""
+        lines = np.arange(1.0, behind + 1.0)[:, None]
+        before, total = packets[:-behind], packets[-behind:]
+        for share, release in self.releases:
+            held = float(np.exp(-1.0 / release))
+            lost = self.loss * share * transfers[:-behind]
+            if self.at_once:
+                left: FloatArray = np.zeros(before.shape[1])
+                for taken, packet in zip(lost / held, before, strict=True):
+                    left = held * np.maximum(left, taken * (packet + left) / (1.0 + taken))
+            else:
+                age = np.arange(len(before) - 1.0, -1.0, -1.0)[:, None]
+                left = np.max(lost * before * held**age, axis=0, initial=0.0)
+            total = total + left * (1.0 - held) * held ** (lines - 1.0)
+        return total
 
     def _as_given(self, read: FloatArray) -> FloatArray:
         """Return lines in the order of their transfers as a frame (rows, cols)."""

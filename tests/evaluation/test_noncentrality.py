@@ -8,22 +8,31 @@ import numpy as np
 import pytest
 
 from evaluation.noncentrality import LibraryChanges, fair_strengths, noncentrality
+from sim.effects.defocus import Defocus
 
 AXES = np.eye(6)
 #: Of the summaries, so that whitened changes are half of what they are in numbers.
 STD = 2.0
 
 
-def summaries(change: np.ndarray) -> SimpleNamespace:
-    """Six summaries of one measurement, displaced by `change` standard deviations from those of a healthy camera."""
+def summaries(change: np.ndarray, everyday: np.ndarray | None = None) -> SimpleNamespace:
+    """Six summaries of one measurement, displaced by `change` standard deviations from those of a healthy camera, with
+    everyday small physics of these changes, in standard deviations."""
     labels = [SimpleNamespace(channel="Y", condition=k, captures=("a",)) for k in range(6)]
-    block = SimpleNamespace(measurement=SimpleNamespace(name="made_up"), labels=labels)
-    return SimpleNamespace(
+    measurement = SimpleNamespace(name="made_up", axis="level", conditions="")
+    block = SimpleNamespace(
+        measurement=measurement, labels=labels, value=np.zeros(6), position=100.0 * np.arange(6.0), reach=1.0,
+        scale=np.ones(6),
+    )  # fmt: skip
+    model = SimpleNamespace(
         blocks=(block,),
+        slices=(slice(0, 6),),
         value=100.0 + STD * change,
         seen=np.ones(6, bool),
         gaussian=lambda _effects: SimpleNamespace(covariance=STD**2 * np.eye(6)),
     )
+    columns = np.zeros((6, 0)) if everyday is None else STD * everyday[:, None]
+    return SimpleNamespace(model=model, everyday=columns)
 
 
 def library(**directions: np.ndarray) -> LibraryChanges:
@@ -46,6 +55,28 @@ def test_a_single_effect_beside_its_nearest_rival() -> None:
     assert 0.85 < share <= 1.0
     (found,), _ = fair_strengths(whole, without, rivals, ["mine"], ("near",), np.random.default_rng(0))
     assert (found.separability, found.rival) == (pytest.approx(36.0), "far")
+
+
+def test_what_is_everyday_isnt_strong() -> None:
+    """6 sigma where everyday small physics has a standard deviation of 3 sigma: 36 / (1 + 9)."""
+    absent, present = (summaries(size * AXES[0], 3.0 * AXES[0]) for size in (0.0, 6.0))
+    assert noncentrality([(present, absent), (present, absent)]) == pytest.approx(3.6)
+    (found,), _ = fair_strengths(
+        [present, present], [[absent, absent]], library(far=AXES[2]), [None], (), np.random.default_rng(0)
+    )
+    assert found.separability == pytest.approx(3.6)
+
+
+def test_a_law_is_told_from_others_as_well_as_its_form_is_known() -> None:
+    """36 sigma by a law that is known to a share e of its change: 36^2 / (1 + 36^2 e^2) are left to tell which it is;
+    the non-centrality is that of the change itself."""
+    absent, present = summaries(0.0 * AXES[0]), summaries(36.0 * AXES[0])
+    assert noncentrality([(present, absent), (present, absent)]) == pytest.approx(1296.0)
+    (found,), _ = fair_strengths(
+        [present, present], [[absent, absent]], library(defocus=AXES[0], far=AXES[2]), ["defocus"], (),
+        np.random.default_rng(0),
+    )  # fmt: skip
+    assert found.separability == pytest.approx(1296.0 / (1.0 + 1296.0 * Defocus.form_tolerance**2))
 
 
 def test_a_pair_of_which_one_imitates_the_other() -> None:

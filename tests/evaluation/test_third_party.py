@@ -10,7 +10,7 @@ import pytest
 
 from evaluation.third_party.camera import BLACK_DN, draw_camera, record_sensor
 from evaluation.third_party.models import SimulatedSensor, SimulatorCheck
-from evaluation.third_party.score import Diagnosed, ScoredSize, share_with_interval, table
+from evaluation.third_party.score import Diagnosed, ScoredSize, share_with_interval, size_table, table
 from tests.peers import missing
 
 ONE = Diagnosed(
@@ -30,6 +30,14 @@ def test_names_of_the_effect_and_its_family_are_right_and_others_are_second_name
     assert row == (
         "| Pyxel | persistence | 4 | 3 of 4 | 3 of 3 (29-100 %) | `source_drift` 1 | 0 | 1 of 2 (1-99 %) | 3 |"
     )
+
+
+def test_sizes_are_told_by_model_and_parameter() -> None:
+    """Of a truth of 2.0: values 2.1 and -3.0, standard deviations 0.1 and 0.25."""
+    wrong = replace(ONE, set=2, sizes=(ScoredSize("share_percent", 2.0, -3.0, -3.5, -2.5),))
+    unlike = replace(ONE, set=3, is_checked=False)
+    row = size_table([ONE, wrong, unlike]).splitlines()[-1]
+    assert row == "| persistence | `share_percent` | 2 | 1 of 2 (1-99 %) | -0.225 | 0.087 |"
 
 
 def test_rates_have_the_binomial_interval() -> None:
@@ -70,7 +78,10 @@ def test_simulators_do_what_they_are_asked_for() -> None:
             missing(f"{package} isn't installed; `make third-party` installs it")
     from evaluation.third_party.experiment import draw_set
 
-    for source in ("inter_pixel_capacitance", "moffat_blur", "cosmic_rays", "column_gain"):
+    sources = "inter_pixel_capacitance", "moffat_blur", "cosmic_rays", "column_gain", "charge_transfer_into_overscan"
+    for source in sources:
         recordings, truth, checked = draw_set(source, 1)
         assert checked.is_right
-        assert truth and recordings.captures("flat")
+        assert truth
+        assert recordings.whole_frame(recordings.captures("flat")[0]).shape == recordings.camera("left").frame_shape
+    assert recordings.camera("left").frame_shape[0] == recordings.camera("left").rows + 16

@@ -53,7 +53,7 @@ import typer
 from lab.formats.importers import Importer
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.observables.observable import measurements
-from sim.scene.chart import Chart
+from sim.scene.chart import PatchChart
 from sim.spectrum import Spectrum
 
 LAMP = Spectrum.of((400.0, 700.0), (1.0, 2.0))
@@ -68,7 +68,7 @@ def read(path, options):
 
 FORMAT = Importer(read)
 GREYS = {f"{i}": Spectrum.of((380.0, 730.0), (i / 7, 0.5)) for i in range(6)}
-CHART = Chart("six patches from grey to colours", 2, 3, GREYS, gap=0.2)
+CHART = PatchChart("six patches from grey to colours", 2, 3, GREYS, gap=0.2)
 COMMANDS = typer.Typer()
 
 
@@ -77,10 +77,10 @@ def greet() -> None:
     print("good morning")
 """
 PERCENT = """
-from sim.scene.chart import Chart
+from sim.scene.chart import PatchChart
 from sim.spectrum import Spectrum
 
-CHART = Chart("in percent", 1, 1, {"white": Spectrum.of((380.0, 730.0), (90.0, 90.0))})
+CHART = PatchChart("in percent", 1, 1, {"white": Spectrum.of((380.0, 730.0), (90.0, 90.0))})
 """
 POINTS = """[calibench.effects]
 hum_of_ours = extension_of_ours:HumOfOurs

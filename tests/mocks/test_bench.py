@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
+from lab.formats.recording_set import DataSheet
 from mocks.bench import Bench, BenchError, Clock
-from mocks.conceal import SIDES
+from mocks.conceal import SIDES, parse
 from mocks.lamp import tristimulus
 from mocks.light_path import (
     LED_FWHM_NM,
@@ -33,6 +34,7 @@ from sim.optics.illumination import irradiance_factor
 from sim.point import edge_profile
 from sim.scene.scenes import UniformField
 from sim.sensor.electrons import dark_current_e_per_s
+from sim.sensor.margins import Margins
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray, Spectrum
 
@@ -521,3 +523,35 @@ def test_clock_is_virtual_unless_asked() -> None:
     slow.sleep(1.0)
     slow.sleep_until(slow.now() + 1.0)
     assert time.monotonic() - began >= 0.1
+
+
+def test_frames_with_margins_hold_the_image_and_what_is_around_it() -> None:
+    """Deferred charge in the j-th row of overscan: (1 - b) b^(j - 1) of the most that any packet of a column has left
+    in the traps, n loss after n transfers, b = exp(-1). A row of 64 pixels and 30 frames scatters by 2.3 / sqrt(1920) =
+    0.05 e, and its shot noise."""
+    margins = Margins(masked_rows=(2, 0), overscan_rows=(0, 8), overscan_cols=(0, 4))
+    bench = Bench(
+        1, concealed=parse(["left:charge_transfer_inefficiency:parallel_ppm=500,release_px=1"]), shape=(48, 64),
+        margins=margins,
+    )  # fmt: skip
+    sheet = DataSheet.model_validate(bench.station_cameras()["left"] | {"quantum_efficiency": None})
+    assert (sheet.rows, sheet.cols, sheet.frame_shape) == (48, 64, (58, 68))
+    assert bench.sensor("left")[:2] == sheet.frame_shape
+    bench.place("sphere")
+    bench.set_shutter(True)
+    frames = np.mean([bench.expose("left", 0.002) for _ in range(30)], axis=0)
+    assert frames.shape == sheet.frame_shape
+    camera = bench._truth.cameras["left"].model
+    electrons = (frames - camera.black_level_dn) / camera.conversion_gain_dn_per_e
+    assert electrons[:2, 10:50].mean() == pytest.approx(0.0, abs=0.5)
+    behind_e, number, held = electrons[50:58, :64].mean(axis=1), np.arange(48), float(np.exp(-1.0))
+    colours_e = [electrons[2:50, first:64:2].mean(axis=1) for first in (0, 1)]  # of even and of odd columns
+    left_e = np.mean([np.max(500e-6 * (number + 1) * e * held ** (47 - number)) for e in colours_e])
+    last_e, lost = np.mean(colours_e, axis=0)[-2:].mean(), 500e-6 * 48
+    for lag in range(3):
+        wanted_e = float(left_e) * (1.0 - held) * held**lag
+        std_e = np.hypot(2.3, np.sqrt(wanted_e)) / np.sqrt(1920.0)
+        # terms of second order: (n loss)^2 of the signal
+        assert behind_e[lag] == pytest.approx(wanted_e, abs=4.0 * std_e + lost**2 * last_e)
+    assert 500.0 < last_e < 8000.0
+    assert bench.expose("right", 0.02).shape == sheet.frame_shape

@@ -113,68 +113,68 @@ def temperature_law(rates: Sequence[tuple[float, float, float]], gain_error: flo
 # Read noise and black level from the darks, and whether rounding hides them.
 
 
-def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
+def read_noise(evaluation: Evaluation) -> tuple[float | None, float | None]:
     """Read noise, e, and its standard deviation: sqrt(floor - s^2 / 12) / K with the step s of the codes, the floor a
     weighted mean over the planes. The floor is the darks' variance less the shot noise of their mean above black, so
     that an error of the black level is one of K times it.
 
     None where darks have no repeats, or where rounding hides the noise.
     """
-    t = e.transfer
-    if not any(level.lamp == "dark" for level, _ in e.points):
-        if any(level.repeats > 1 for level in e.levels.darks):
-            e.remarks.add(
+    t = evaluation.transfer
+    if not any(level.lamp == "dark" for level, _ in evaluation.points):
+        if any(level.repeats > 1 for level in evaluation.levels.darks):
+            evaluation.remarks.add(
                 "repeated dark frames are all alike: rounding hides the read noise, which is below "
-                f"{0.4 * e.levels.step_dn / t.gain:.2f} e"
+                f"{0.4 * evaluation.levels.step_dn / t.gain:.2f} e"
             )
         return None, None
     count = t.floor.size
-    own = t.covariance[2:, 2:]
-    weight = 1.0 / np.diag(own)
+    floor_covariance = t.covariance[2:, 2:]
+    weight = 1.0 / np.diag(floor_covariance)
     weight /= weight.sum()
     floor = float(weight @ t.floor)
-    if floor < e.levels.hidden_dn2:
-        e.remarks.add(
+    if floor < evaluation.levels.hidden_dn2:
+        evaluation.remarks.add(
             f"the temporal noise of dark frames is {np.sqrt(max(floor, 0)):.2f} DN, where rounding hides it: the read "
             "noise is below "
-            f"{0.4 * e.levels.step_dn / t.gain:.2f} e; a higher gain would show it"
+            f"{0.4 * evaluation.levels.step_dn / t.gain:.2f} e; a higher gain would show it"
         )
         return None, None
-    between = float(np.sum((t.floor - floor) ** 2 / np.diag(own)))
+    between = float(np.sum((t.floor - floor) ** 2 / np.diag(floor_covariance)))
     gradient = np.zeros(2 + count)
-    noise = float(np.sqrt(floor - e.levels.quantisation_dn2))
+    noise = float(np.sqrt(floor - evaluation.levels.quantisation_dn2))
     gradient[0] = -noise / t.gain**2
     gradient[2:] = weight / (2.0 * noise * t.gain)
     widened = t.covariance.copy()
     widened[2:, 2:] *= chi2_factor(between, count - 1)
-    black = 0.5 * float(np.sqrt(e.dark.lines[None].covariance[0, 0])) / noise
+    black = 0.5 * float(np.sqrt(evaluation.dark.lines[None].covariance[0, 0])) / noise
     return noise / t.gain, float(np.hypot(np.sqrt(gradient @ widened @ gradient), black))
 
 
-def black_level(e: Evaluation) -> tuple[float | None, float | None]:
+def black_level(evaluation: Evaluation) -> tuple[float | None, float | None]:
     """Return the black level, DN, and its standard deviation: the dark line at no exposure. The standard deviation
     includes the fixed pattern as a sample of the camera.
     """
-    if not e.levels.darks:
+    if not evaluation.levels.darks:
         return None, None
-    line, patterns = e.dark.lines[None], []
-    for name in e.levels.names:
-        plane = e.levels.darks[0].plane[name]
+    line, patterns = evaluation.dark.lines[None], []
+    for name in evaluation.levels.names:
+        plane = evaluation.levels.darks[0].plane[name]
         if plane.every_pixel is not None and np.isfinite(plane.temporal_variance):  # one frame can't tell it from noise
             patterns.append(plane.every_pixel.mean_std(plane.shape))
     pattern = float(np.sqrt(np.sum(np.square(patterns)))) / max(len(patterns), 1)
     return line.black, float(np.hypot(np.sqrt(line.covariance[0, 0]), pattern))
 
 
-def dark_signal_hidden(e: Evaluation) -> bool:
+def dark_signal_hidden(evaluation: Evaluation) -> bool:
     """Return whether rounding hides the dark signal; reported where it does.
 
     Where neither noise nor pattern spreads the values over codes, their means don't follow the signal.
     """
-    spread = min(level.plane[name].spread for level in e.levels.darks for name in e.levels.names)
-    if spread >= e.levels.hidden_dn2:
+    spread = min(level.plane[name].spread for level in evaluation.levels.darks for name in evaluation.levels.names)
+    if spread >= evaluation.levels.hidden_dn2:
         return False
-    e.remarks.add(
+    evaluation.remarks.add(
         f"noise and pattern of the darks spread over {np.sqrt(spread):.2f} DN only, so rounding decides their means: "
         "dark current "
         "and DSNU aren't determined, and the black level to its rounding; a higher gain would show them"
@@ -185,37 +185,39 @@ def dark_signal_hidden(e: Evaluation) -> bool:
 # Dark current: from the dark means, from the dark variances, and against temperature.
 
 
-def dark_current(e: Evaluation) -> tuple[float | None, float | None]:
+def dark_current(evaluation: Evaluation) -> tuple[float | None, float | None]:
     """Return the dark current, e/s, and its standard deviation: slope of the dark mean against exposure over K."""
-    if not e.levels.darks:
+    if not evaluation.levels.darks:
         return None, None
-    line = e.dark.lines[None]
+    line = evaluation.dark.lines[None]
     if line.rate is None:
-        e.remarks.add("all darks have one exposure: the dark current isn't determined; capture darks of a longer one")
+        evaluation.remarks.add(
+            "all darks have one exposure: the dark current isn't determined; capture darks of a longer one"
+        )
         return None, None
-    if dark_signal_hidden(e):
+    if dark_signal_hidden(evaluation):
         return None, None
-    return in_electrons(e, line.rate, float(np.sqrt(line.covariance[1, 1])))
+    return in_electrons(evaluation, line.rate, float(np.sqrt(line.covariance[1, 1])))
 
 
-def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | None]:
+def dark_current_from_variance(evaluation: Evaluation) -> tuple[float | None, float | None]:
     """Return the dark current, e/s, and its standard deviation: slope of the dark variance against exposure over K^2,
     all planes together.
 
     K is that of the flats: the photon transfer of the darks themselves contains the same slope.
     """
-    repeated = [level for level in e.levels.darks if level.repeats > 1]
+    repeated = [level for level in evaluation.levels.darks if level.repeats > 1]
     exposure = np.array([level.exposure_s for level in repeated])
-    if np.unique(exposure).size < 3 or dark_signal_hidden(e):
+    if np.unique(exposure).size < 3 or dark_signal_hidden(evaluation):
         return None, None
     rates, weights = [], []
-    for name in e.levels.names:
+    for name in evaluation.levels.names:
         planes = [level.plane[name] for level in repeated]
         variance = np.array([plane.temporal_variance for plane in planes])
         std = np.array([plane.temporal_variance_std for plane in planes])
         # a charge that drifts changes the shot noise by the gain times its change
-        std = np.hypot(std, e.transfer.gain * np.array([level.drift_std_dn for level in repeated]))
-        if variance.min() < e.levels.hidden_dn2:
+        std = np.hypot(std, evaluation.transfer.gain * np.array([level.drift_std_dn for level in repeated]))
+        if variance.min() < evaluation.levels.hidden_dn2:
             return None, None
         line = dark_line(exposure, variance, std)
         if line.rate is not None:
@@ -223,11 +225,11 @@ def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | Non
             weights.append(1.0 / line.covariance[1, 1])
     try:
         flats = transfer_of(
-            e.levels,
-            e.dark,
-            e.saturation,
+            evaluation.levels,
+            evaluation.dark,
+            evaluation.saturation,
             [level for level in repeated if level.exposure_s == exposure.min()],
-            e.consistency.series,
+            evaluation.consistency.series,
         )[0]
     except NotDetermined:
         return None, None
@@ -237,7 +239,7 @@ def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | Non
     return rate / flats.gain**2, std_of_rate / flats.gain**2
 
 
-def dark_temperature_c(e: Evaluation) -> float | None:
+def dark_temperature_c(evaluation: Evaluation) -> float | None:
     """Return the sensor temperature (deg C) at which the dark currents were measured; None where the darks don't state
     it.
 
@@ -245,58 +247,60 @@ def dark_temperature_c(e: Evaluation) -> float | None:
     longer it is."""
     darks = [
         (level.exposure_s, level.temperature_c if level.sensor_c is None else level.sensor_c)
-        for level in e.levels.darks
+        for level in evaluation.levels.darks
     ]
     known = [(exposure_s, sensor_c) for exposure_s, sensor_c in darks if sensor_c is not None]
     total_s = sum(exposure_s for exposure_s, _ in known)
     return sum(exposure_s * sensor_c for exposure_s, sensor_c in known) / total_s if total_s > 0 else None
 
 
-def remark_on_temperatures(e: Evaluation) -> None:
+def remark_on_temperatures(evaluation: Evaluation) -> None:
     """Remark on flats that were taken at another temperature than the darks that are subtracted: more than a degree
     apart, to which levels are grouped, and where a dark current that is significant (three standard deviations) would
     change a mean by more than three of its own, the scatter of the light included."""
-    dark_c = dark_temperature_c(e)
+    dark_c = dark_temperature_c(evaluation)
     if dark_c is None:
         return
     changes: list[tuple[float, float, float]] = []
-    for level in e.levels.flats:
+    for level in evaluation.levels.flats:
         rise_c = 0.0 if level.temperature_c is None else level.temperature_c - dark_c
         for name, plane in level.plane.items():
-            line = e.dark.lines[name]
+            line = evaluation.dark.lines[name]
             if abs(rise_c) <= 1.0 or line.rate is None or line.rate < 3.0 * math.sqrt(line.covariance[1, 1]):
                 continue
             signal_dn = plane.mean - line.black
-            std_dn = math.hypot(0.0 if math.isnan(plane.mean_std) else plane.mean_std, e.light_scatter * signal_dn)
+            std_dn = math.hypot(
+                0.0 if math.isnan(plane.mean_std) else plane.mean_std, evaluation.light_scatter * signal_dn
+            )
             change_dn = line.rate * level.exposure_s * (2.0 ** (rise_c / DOUBLING_C) - 1.0)
             if abs(change_dn) > 3.0 * std_dn and signal_dn > 0.0:
                 changes.append((abs(change_dn) / signal_dn, change_dn, dark_c + rise_c))
     if changes:
         share, change_dn, flat_c = max(changes)
-        e.remarks.add(
+        evaluation.remarks.add(
             f"flats at {flat_c:.1f} °C have darks at {dark_c:.1f} °C subtracted: their own dark signal differs by "
             f"{change_dn:+.2g} DN, {100.0 * share:.2g} % of the signal, if it doubles every {DOUBLING_C:g} °C; "
             "take darks at the temperature of the flats"
         )
 
 
-def dark_current_temperature(e: Evaluation) -> DarkCurrentLaws | None:
+def dark_current_temperature(evaluation: Evaluation) -> DarkCurrentLaws | None:
     """Return the dark current at every temperature with darks of two exposures, and the laws through those
     significantly above 0.
     """
     rates: list[tuple[float, float, float]] = []
-    temperatures = {level.temperature_c for level in e.levels.all_darks if level.temperature_c is not None}
+    temperatures = {level.temperature_c for level in evaluation.levels.all_darks if level.temperature_c is not None}
     for temperature in sorted(temperatures):
-        darks = [level for level in e.levels.all_darks if level.temperature_c == temperature]
-        line = dark_line(np.array([level.exposure_s for level in darks]), *mean_and_std(darks, e.levels.names))
+        darks = [level for level in evaluation.levels.all_darks if level.temperature_c == temperature]
+        line = dark_line(np.array([level.exposure_s for level in darks]), *mean_and_std(darks, evaluation.levels.names))
         if line.rate is not None:
             std = float(np.sqrt(line.covariance[1, 1]))
-            rates.append((temperature, line.rate / e.transfer.gain, std / e.transfer.gain))
+            rates.append((temperature, line.rate / evaluation.transfer.gain, std / evaluation.transfer.gain))
     if not rates:
         return None
-    laws = temperature_law(rates, e.transfer.gain_std / e.transfer.gain)
+    laws = temperature_law(rates, evaluation.transfer.gain_std / evaluation.transfer.gain)
     columns = (laws.temperature_c, laws.dark_current_e_per_s, laws.dark_current_e_per_s_std)
     for temperature, current, std in zip(*columns, strict=True):
-        own_value = ", the value given" if temperature == e.levels.temperature_c else ""
-        e.remarks.add(f"the dark current at {temperature:g} deg C is {current:.4g} ± {std:.2g} e/s{own_value}")
+        own_value = ", the value given" if temperature == evaluation.levels.temperature_c else ""
+        evaluation.remarks.add(f"the dark current at {temperature:g} deg C is {current:.4g} ± {std:.2g} e/s{own_value}")
     return laws

@@ -70,7 +70,7 @@ class Measured:
     value: float
     std: float
 
-    def over(self, divisor: Measured) -> Measured:
+    def divide_by(self, divisor: Measured) -> Measured:
         """Return the quotient of independent numbers."""
         quotient = self.value / divisor.value
         return Measured(quotient, math.hypot(self.std / divisor.value, quotient * divisor.std / divisor.value))
@@ -104,21 +104,21 @@ class EmvaLevels:
             np.array([plane.temporal_variance_std for plane in bright]), given.variance_error * self.variance
         )
         # The dark of the same exposure where there is one, else the line through all darks
-        self.source = [self._taken(level.exposure_s) for level in self.flats]
-        self.below_mean = self.below(self.dark_mean, self.mean_line)
-        self.below_variance = self.below(self.dark_variance, self.variance_line)
+        self.source = [self._find_dark(level.exposure_s) for level in self.flats]
+        self.below_mean = self.dark_at_levels(self.dark_mean, self.mean_line)
+        self.below_variance = self.dark_at_levels(self.dark_variance, self.variance_line)
         self.signal = self.mean - self.below_mean
         lamp_error = np.maximum(given.lamp_error, [level.light_std for level in self.flats])
         self.light_mean_std = np.hypot([plane.mean_std for plane in bright], lamp_error * self.signal)
-        self.signal_std = np.hypot(self.light_mean_std, self.below(self.dark_mean_std, None))
+        self.signal_std = np.hypot(self.light_mean_std, self.dark_at_levels(self.dark_mean_std, None))
 
-    def _taken(self, exposure_s: float) -> int | None:
+    def _find_dark(self, exposure_s: float) -> int | None:
         if not self.dark_exposure.size:
             return None
         nearest = int(np.argmin(np.abs(self.dark_exposure - exposure_s)))
         return nearest if abs(self.dark_exposure[nearest] - exposure_s) <= 1e-6 * exposure_s else None
 
-    def below(self, stack_of: FloatArray, line: DarkLine | None) -> FloatArray:
+    def dark_at_levels(self, stack_of: FloatArray, line: DarkLine | None) -> FloatArray:
         """Return the dark value at the exposure of each level; where none was taken, that of the line, or (None) the
         smallest of all.
         """
@@ -184,10 +184,17 @@ def mean_std(levels: Sequence[MeasuredLevel], name: str) -> FloatArray:
 
 
 def mean_ratio(x: FloatArray, y: FloatArray, std: FloatArray, slope: Measured) -> float | None:
-    """Return the mean of y / x (levels,), where it or the single levels contradict the line y = `slope` x by more than
-    the noise `std` (levels,) of y; None where they don't.
+    """Return the mean of y / x, where it or the single levels contradict the line y = `slope` x; None where they don't.
+
+    x, y : (levels,)
+    std : standard deviations of y by noise, (levels,)
+    slope : fitted to the same levels, weighted by noise
 
     It is the slope of the same line with equal relative weights: where y is proportional to x, both are the same.
+
+    >>> x = np.array([1.0, 2.0, 3.0, 4.0])
+    >>> mean_ratio(x, 0.5 * x, np.full(4, 0.01), Measured(0.5, 0.01)) is None
+    True
     """
     chosen = x > LEAST_SIGNAL * np.max(x, initial=0.0)
     if np.count_nonzero(chosen) < 3:
@@ -300,7 +307,7 @@ def _saturation(at: EmvaLevels, given: EmvaInput, remarks: list[str]) -> tuple[f
 
 def _widen_gain(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list[str]) -> Measured:
     """Return the system gain with what its line leaves of the variances in its standard deviation."""
-    std = np.hypot(at.variance_std, at.below(at.dark_variance_std, None))
+    std = np.hypot(at.variance_std, at.dark_at_levels(at.dark_variance_std, None))
     signal = at.signal[used]
     ratio = mean_ratio(signal, (at.variance - at.below_variance)[used], std[used], gain)
     if ratio is None:
@@ -335,7 +342,7 @@ def _responsivity(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list
             "quantum efficiency"
         )
         responsivity = Measured(responsivity.value, math.hypot(std, ratio - responsivity.value))
-    return {"responsivity_dn_per_photon": responsivity, "quantum_efficiency": responsivity.over(gain)}
+    return {"responsivity_dn_per_photon": responsivity, "quantum_efficiency": responsivity.divide_by(gain)}
 
 
 def _dark_noise(at: EmvaLevels, gain: Measured, remarks: list[str]) -> tuple[Figures, float | None]:
@@ -357,7 +364,7 @@ def _dark_noise(at: EmvaLevels, gain: Measured, remarks: list[str]) -> tuple[Fig
     noise_e = math.sqrt(square.value - QUANTISATION_DN2 * at.step_dn**2)
     return {
         "temporal_dark_noise_dn": Measured(noise_dn, square.std / (2.0 * noise_dn)),
-        "temporal_dark_noise_e": Measured(noise_e, square.std / (2.0 * noise_e)).over(gain),
+        "temporal_dark_noise_e": Measured(noise_e, square.std / (2.0 * noise_e)).divide_by(gain),
     }, None
 
 
@@ -370,7 +377,7 @@ def _sensitivity(at: EmvaLevels, top: int | None, gain: Measured, figures: Figur
     efficiency = figures.get("quantum_efficiency")
     dark = figures.get("temporal_dark_noise_dn")
     if dark is not None:
-        dark_e = dark.over(gain)
+        dark_e = dark.divide_by(gain)
         inner = math.sqrt(dark_e.value**2 + 0.25)
         given["sensitivity_threshold_e"] = Measured(inner + 0.5, dark_e.value * dark_e.std / inner)
         if responsivity is not None:
@@ -395,12 +402,12 @@ def _sensitivity(at: EmvaLevels, top: int | None, gain: Measured, figures: Figur
         )
         given["saturation_capacity_photons"] = light
         if "sensitivity_threshold_photons" in given:
-            given["dynamic_range"] = light.over(given["sensitivity_threshold_photons"])
+            given["dynamic_range"] = light.divide_by(given["sensitivity_threshold_photons"])
     else:
-        full = signal.over(gain)
+        full = signal.divide_by(gain)
         if dark is not None:
             threshold_dn = math.sqrt(dark.value**2 + gain.value**2 / 4.0) + gain.value / 2.0
-            given["dynamic_range"] = signal.over(Measured(threshold_dn, math.hypot(dark.std, gain.std)))
+            given["dynamic_range"] = signal.divide_by(Measured(threshold_dn, math.hypot(dark.std, gain.std)))
     given["saturation_capacity_e"] = full
     given["snr_max"] = Measured(math.sqrt(full.value), full.std / (2.0 * math.sqrt(full.value)))
     return given
@@ -431,11 +438,11 @@ def _dark_current(at: EmvaLevels, gain: Measured, remarks: list[str]) -> Figures
         remarks.append("rounding hides the dark current, which the means of the darks don't show")
     elif mean.rate is not None:
         rate = Measured(mean.rate, math.sqrt(float(mean.covariance[1, 1])))
-        figures["dark_current_from_mean_e_per_s"] = rate.over(gain)
+        figures["dark_current_from_mean_e_per_s"] = rate.divide_by(gain)
     if variance.rate is not None and not hidden:
         rate = Measured(variance.rate, math.sqrt(float(variance.covariance[1, 1])))
         square = Measured(gain.value**2, 2.0 * gain.value * gain.std)
-        figures["dark_current_from_variance_e_per_s"] = rate.over(square)
+        figures["dark_current_from_variance_e_per_s"] = rate.divide_by(square)
     return figures
 
 
@@ -482,7 +489,7 @@ def _spatial(plane: str, stacks: _Stacks, gain: Measured) -> Figures:
     if dark is None:
         return figures
     for name, square in _parts(dark).items():
-        figures[f"dsnu{name}_e"] = Measured(*root(square.value, square.std)).over(gain)
+        figures[f"dsnu{name}_e"] = Measured(*root(square.value, square.std)).divide_by(gain)
     bright = stacks.bright.plane[plane].every_pixel if stacks.bright is not None else None
     if bright is None or stacks.bright is None or stacks.dark is None:
         return figures
@@ -561,7 +568,7 @@ def _plot_points(at: EmvaLevels, given: EmvaInput, deviation: FloatArray, stacks
         dark_variance_dn2=values_of(at.below_variance),
         linearity_deviation_percent=tuple(None if np.isnan(value) else float(value) for value in deviation),
         signal_dn_std=values_of(at.signal_std),
-        excess_variance_dn2_std=values_of(np.hypot(at.variance_std, at.below(at.dark_variance_std, None))),
+        excess_variance_dn2_std=values_of(np.hypot(at.variance_std, at.dark_at_levels(at.dark_variance_std, None))),
         dark_exposure_s=values_of(at.dark_exposure),
         dark_exposure_mean_dn=values_of(at.dark_mean),
         dark_exposure_mean_dn_std=values_of(at.dark_mean_std),

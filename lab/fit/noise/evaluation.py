@@ -180,39 +180,43 @@ def transfer_of(
     return transfer, points
 
 
-def _remark_on_transfer(e: Evaluation) -> None:
+def _remark_on_transfer(evaluation: Evaluation) -> None:
     """Report an error of the model, a straight line taken for the gain, and a significant curvature."""
-    t = e.transfer
+    t = evaluation.transfer
     if t.model_error > 0:
-        e.remarks.add(
+        evaluation.remarks.add(
             f"the variances of the flats depart from their curve by {100 * t.model_error:.2g} % (rms) beyond what "
             "sampling explains "
             "(an uneven converter does that): it is in the uncertainties"
         )
-    share = 1.0 if e.reaches_saturation else e.reach
-    at = "at saturation" if e.reaches_saturation else f"at the highest level, {100 * e.reach:.2g} % of saturation"
+    share = 1.0 if evaluation.reaches_saturation else evaluation.reach
+    at = (
+        "at saturation"
+        if evaluation.reaches_saturation
+        else f"at the highest level, {100 * evaluation.reach:.2g} % of saturation"
+    )
     bend, bend_std = 100 * share * t.relative_curvature, 100 * share * t.relative_curvature_std
-    if not e.reaches_saturation:
-        e.remarks.add(
-            f"the highest level of the photon transfer is {100 * e.reach:.2g} % of saturation, "
+    if not evaluation.reaches_saturation:
+        evaluation.remarks.add(
+            f"the highest level of the photon transfer is {100 * evaluation.reach:.2g} % of saturation, "
             f"{100 * LEAST_REACH:.0f} % are needed: curvatures at "
             "saturation aren't given; expose longer, or correct bit_depth or white_level_dn"
         )
     if t.by_line:
-        e.remarks.add(
+        evaluation.remarks.add(
             f"the bend of the variances ({bend:+.1f} +- {bend_std:.1f} % {at}) isn't "
             "significant against that: the conversion gain is EMVA's straight line to 70 % of saturation; at zero "
             "signal "
             f"the curve has {t.curve_gain:.4g} +- {t.curve_gain_std:.2g} DN/e"
         )
     elif abs(t.relative_curvature) > 4.0 * t.relative_curvature_std:
-        e.remarks.add(
+        evaluation.remarks.add(
             f"the variance bends by {bend:+.1f} +- {bend_std:.1f} % of its line {at} "
             "(nonlinear response or brighter-fatter); the conversion gain is that at zero signal"
         )
 
 
-def in_electrons(e: Evaluation, value: float, std: float) -> tuple[float, float]:
+def in_electrons(evaluation: Evaluation, value: float, std: float) -> tuple[float, float]:
     """Return a `value` in DN with its standard deviation in electrons, with that of the gain."""
-    gain = e.transfer.gain
-    return value / gain, float(np.hypot(std / gain, value * e.transfer.gain_std / gain**2))
+    gain = evaluation.transfer.gain
+    return value / gain, float(np.hypot(std / gain, value * evaluation.transfer.gain_std / gain**2))

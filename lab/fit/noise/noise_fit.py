@@ -67,30 +67,30 @@ from sim.camera import Side
 ASYMMETRY = 0.002  # difference of the light on opposite edges, of the mean, above which it is reported
 
 
-def dsnu(e: Evaluation) -> tuple[float | None, float | None]:
+def dsnu(evaluation: Evaluation) -> tuple[float | None, float | None]:
     """Return DSNU, e, and its standard deviation: the spatial standard deviation of the dark pattern over K."""
-    pattern = dark_pattern(e)
-    if pattern is None or dark_signal_hidden(e):
+    pattern = dark_pattern(evaluation)
+    if pattern is None or dark_signal_hidden(evaluation):
         return None, None
     level, square, std = pattern
-    if min(level.plane[name].temporal_variance for name in e.levels.names) < e.levels.hidden_dn2:
-        std = float(np.hypot(std, e.levels.quantisation_dn2))  # the mean of each pixel is rounded
-    return in_electrons(e, *root(square, std))
+    if min(level.plane[name].temporal_variance for name in evaluation.levels.names) < evaluation.levels.hidden_dn2:
+        std = float(np.hypot(std, evaluation.levels.quantisation_dn2))  # the mean of each pixel is rounded
+    return in_electrons(evaluation, *root(square, std))
 
 
-def prnu(e: Evaluation) -> tuple[float | None, float | None]:
+def prnu(evaluation: Evaluation) -> tuple[float | None, float | None]:
     """Return PRNU, %, and its standard deviation: sqrt(pattern variance - dark pattern variance) / signal, of the flat
     nearest to half of saturation, mean over the planes.
     """
-    dark = dark_pattern(e)
+    dark = dark_pattern(evaluation)
     dark_variance = max(dark[1], 0.0) if dark else 0.0
     values, stds, levels = [], [], []
-    for name in e.levels.names:
+    for name in evaluation.levels.names:
         candidates = []
-        for level, clipped in zip(e.levels.flats, e.saturation.clipped[name], strict=True):
+        for level, clipped in zip(evaluation.levels.flats, evaluation.saturation.clipped[name], strict=True):
             plane = level.plane[name]
-            signal = plane.mean - e.dark.mean_dn(name, level.exposure_s)
-            share = signal / e.saturation.signal_dn[name]
+            signal = plane.mean - evaluation.dark.mean_dn(name, level.exposure_s)
+            share = signal / evaluation.saturation.signal_dn[name]
             if clipped or plane.repeats < 2 or share < 0.1:
                 continue
             candidates.append((0.3 <= share <= 0.7, plane.repeats, -abs(share - 0.5), signal, plane))
@@ -102,47 +102,53 @@ def prnu(e: Evaluation) -> tuple[float | None, float | None]:
         stds.append(100.0 * spread_std / signal)
         levels.append((distance, plane.defects))
     if not values:
-        e.remarks.add("no unsaturated flats above 10 % of saturation: the PRNU isn't determined; expose longer")
+        evaluation.remarks.add(
+            "no unsaturated flats above 10 % of saturation: the PRNU isn't determined; expose longer"
+        )
         return None, None
     farthest = -min(levels)[0]
     if farthest > 0.2:
-        e.remarks.add(
+        evaluation.remarks.add(
             f"PRNU comes from flats as far as {100 * farthest:.0f} % from half of saturation, where it should be taken"
         )
-    outliers = sum(count for _, count in levels) - e.levels.defects
+    outliers = sum(count for _, count in levels) - evaluation.levels.defects
     if outliers > 0:
-        e.remarks.add(f"{outliers} pixels respond more than {DEFECT_SIGMA:g} standard deviations off: left out of PRNU")
+        evaluation.remarks.add(
+            f"{outliers} pixels respond more than {DEFECT_SIGMA:g} standard deviations off: left out of PRNU"
+        )
     weight = 1.0 / np.maximum(np.array(stds), 1e-9) ** 2
     value = float(np.sum(weight * values) / weight.sum())
     chi2 = float(np.sum(weight * (np.array(values) - value) ** 2))
     return value, float(np.sqrt(chi2_factor(chi2, len(values) - 1) / weight.sum()))
 
 
-def dark_pattern(e: Evaluation) -> tuple[MeasuredLevel, float, float] | None:
+def dark_pattern(evaluation: Evaluation) -> tuple[MeasuredLevel, float, float] | None:
     """Return the darks that determine the fixed pattern best (most repeats, then shortest), its variance, DN^2, and the
     standard deviation of that.
     """
-    repeated = [level for level in e.levels.darks if level.repeats > 1]
+    repeated = [level for level in evaluation.levels.darks if level.repeats > 1]
     if not repeated:
         return None
     level = max(repeated, key=lambda level: (level.repeats, -level.exposure_s))
-    planes = [level.plane[name] for name in e.levels.names]
+    planes = [level.plane[name] for name in evaluation.levels.names]
     pixels = np.array([plane.pixels for plane in planes], float)
     pixels /= pixels.sum()
     value = float(pixels @ [plane.spatial_variance for plane in planes])
     return level, value, float(np.sqrt(np.sum((pixels * [plane.spatial_variance_std for plane in planes]) ** 2)))
 
 
-def remark_on_shading(e: Evaluation) -> None:
+def remark_on_shading(evaluation: Evaluation) -> None:
     """Report light that differs between opposite edges: cos^4 doesn't, a lamp off the axis or a decentred lens does."""
     edges: list[tuple[float, ...]] = []
-    for level in e.levels.flats:
-        for name in e.levels.names:
+    for level in evaluation.levels.flats:
+        for name in evaluation.levels.names:
             plane = level.plane[name]
-            share = (plane.mean - e.dark.lines[name].black) / e.saturation.signal_dn[name]
-            if 0.3 <= share <= 0.7 and not e.saturation.clipped[name][e.levels.flats.index(level)]:
-                lift = plane.mean / (plane.mean - e.dark.lines[name].black)
-                edges.append(tuple(1.0 + lift * (e - 1.0) for e in (*plane.shading_rows, *plane.shading_columns)))
+            share = (plane.mean - evaluation.dark.lines[name].black) / evaluation.saturation.signal_dn[name]
+            if 0.3 <= share <= 0.7 and not evaluation.saturation.clipped[name][evaluation.levels.flats.index(level)]:
+                lift = plane.mean / (plane.mean - evaluation.dark.lines[name].black)
+                edges.append(
+                    tuple(1.0 + lift * (ratio - 1.0) for ratio in (*plane.shading_rows, *plane.shading_columns))
+                )
     if not edges:
         return
     first_row, last_row, first_col, last_col = np.mean(edges, axis=0)
@@ -152,7 +158,7 @@ def remark_on_shading(e: Evaluation) -> None:
         if abs(last - first) > ASYMMETRY
     ]
     if slopes:
-        e.remarks.add(f"the flats' shading is asymmetric: {'; '.join(slopes)}, of the mean")
+        evaluation.remarks.add(f"the flats' shading is asymmetric: {'; '.join(slopes)}, of the mean")
 
 
 # The noise fit of one camera: all figures, by channel too, with the points of its plots.
@@ -176,124 +182,134 @@ def noise_fit(
     return _result(evaluate(darks, flats, camera, gain_db, defects, tuple(flats[0].plane)), pixels)
 
 
-def _result(e: Evaluation, pixels: PixelFigures | None) -> NoiseFit:
+def _result(evaluation: Evaluation, pixels: PixelFigures | None) -> NoiseFit:
     """All figures. The order of the steps is that of the remarks."""
-    t = e.transfer
-    scale = 10.0 ** (-e.levels.gain_db / 20.0)
-    remark_on_scatter(e)
-    remark_on_levels(e)
-    remark_on_shading(e)
-    remark_on_temperatures(e)
-    principal = principal_figures(e)
-    figures: dict[str, Any] = principal | quantum_efficiency(e)
-    from_variance, from_variance_std = dark_current_from_variance(e)
-    of_pixels = pixels.at_gain(t.gain) if pixels is not None and e.levels.darks else PixelFigures()
+    t = evaluation.transfer
+    scale = 10.0 ** (-evaluation.levels.gain_db / 20.0)
+    remark_on_scatter(evaluation)
+    remark_on_levels(evaluation)
+    remark_on_shading(evaluation)
+    remark_on_temperatures(evaluation)
+    principal = principal_figures(evaluation)
+    figures: dict[str, Any] = principal | quantum_efficiency(evaluation)
+    from_variance, from_variance_std = dark_current_from_variance(evaluation)
+    of_pixels = pixels.at_gain(t.gain) if pixels is not None and evaluation.levels.darks else PixelFigures()
     return NoiseFit(
         **figures,
         conversion_gain_at_zero_dn_per_e=t.curve_gain * scale,
         conversion_gain_at_zero_dn_per_e_std=t.curve_gain_std * scale,
         variance_model_error_percent=100.0 * t.model_error,
-        **variance_curvature_figures(e),
+        **variance_curvature_figures(evaluation),
         dark_current_from_variance_e_per_s=from_variance,
         dark_current_from_variance_e_per_s_std=from_variance_std,
-        dark_temperature_c=dark_temperature_c(e),
-        dark_current_temperature=dark_current_temperature(e),
+        dark_temperature_c=dark_temperature_c(evaluation),
+        dark_current_temperature=dark_current_temperature(evaluation),
         read_noise_distribution=of_pixels.noise,
         defects=of_pixels.defects,
-        inconsistent_levels=e.consistency.inconsistent,
-        response_scatter_percent=100.0 * e.consistency.scatter,
-        channels=channel_figures(e, principal),
-        emva1288=emva1288_by_plane(e),
-        photon_transfer=photon_transfer_points(e, linearity_by_plane(e)[1]),
-        remarks=tuple(e.remarks.sentences),
+        inconsistent_levels=evaluation.consistency.inconsistent,
+        response_scatter_percent=100.0 * evaluation.consistency.scatter,
+        channels=channel_figures(evaluation, principal),
+        emva1288=emva1288_by_plane(evaluation),
+        photon_transfer=photon_transfer_points(evaluation, linearity_by_plane(evaluation)[1]),
+        remarks=tuple(evaluation.remarks.sentences),
     )
 
 
-def principal_figures(e: Evaluation) -> dict[str, float | None]:
+def principal_figures(evaluation: Evaluation) -> dict[str, float | None]:
     """Return the figures that stand for the sensor and for each channel, with their standard deviations."""
-    scale = 10.0 ** (-e.levels.gain_db / 20.0)
+    scale = 10.0 ** (-evaluation.levels.gain_db / 20.0)
     figures: dict[str, tuple[float | None, float | None]] = {
-        "conversion_gain_dn_per_e": (e.transfer.gain * scale, e.transfer.gain_std * scale),
-        "read_noise_e": read_noise(e),
-        "black_level_dn": black_level(e),
-        "dark_current_e_per_s": dark_current(e),
-        "dsnu_e": dsnu(e),
-        "prnu_percent": prnu(e),
-        "full_well_e": full_well(e),
-        "linearity_error_percent": linearity_error(e),
+        "conversion_gain_dn_per_e": (evaluation.transfer.gain * scale, evaluation.transfer.gain_std * scale),
+        "read_noise_e": read_noise(evaluation),
+        "black_level_dn": black_level(evaluation),
+        "dark_current_e_per_s": dark_current(evaluation),
+        "dsnu_e": dsnu(evaluation),
+        "prnu_percent": prnu(evaluation),
+        "full_well_e": full_well(evaluation),
+        "linearity_error_percent": linearity_error(evaluation),
     }
     values = {name: value for name, (value, _) in figures.items()}
     return values | {f"{name}_std": std for name, (_, std) in figures.items()}
 
 
-def channel_figures(e: Evaluation, principal: dict[str, float | None]) -> dict[str, ChannelNoise]:
+def channel_figures(evaluation: Evaluation, principal: dict[str, float | None]) -> dict[str, ChannelNoise]:
     """Return the figures of each colour by itself; a channel that its levels don't determine is reported instead."""
     noise_of_channel: dict[str, ChannelNoise] = {}
-    for channel in dict.fromkeys(name[0] for name in e.levels.names):
-        planes_of_channel = tuple(name for name in e.levels.names if name[0] == channel)
+    for channel in dict.fromkeys(name[0] for name in evaluation.levels.names):
+        planes_of_channel = tuple(name for name in evaluation.levels.names if name[0] == channel)
         try:
             part = (
                 principal
-                if planes_of_channel == e.levels.names
+                if planes_of_channel == evaluation.levels.names
                 else principal_figures(
                     evaluate(
-                        e.levels.all_darks, e.levels.flats, e.levels.camera, e.levels.gain_db, 0, planes_of_channel
+                        evaluation.levels.all_darks,
+                        evaluation.levels.flats,
+                        evaluation.levels.camera,
+                        evaluation.levels.gain_db,
+                        0,
+                        planes_of_channel,
                     )
                 )
             )
         except NotDetermined as refused:
-            e.remarks.add(f"channel {channel} alone: {refused.reason}")
+            evaluation.remarks.add(f"channel {channel} alone: {refused.reason}")
             continue
         noise_of_channel[channel] = ChannelNoise(**part)
     return noise_of_channel
 
 
-def emva1288_by_plane(e: Evaluation) -> dict[str, Emva1288]:
+def emva1288_by_plane(evaluation: Evaluation) -> dict[str, Emva1288]:
     """Compute the figures as specified in EMVA 1288, by plane; what a plane lacks is reported."""
     figures_of_plane: dict[str, Emva1288] = {}
-    main = sorted(main_lamp_levels(e), key=lambda level: level.light)
+    main = sorted(main_lamp_levels(evaluation), key=lambda level: level.light)
     lamp = main[0].lamp
     photons = isinstance(lamp, tuple) and len(lamp) == 3 and bool(lamp[1])
-    for name in e.levels.names:
+    for name in evaluation.levels.names:
         given = EmvaInput(
             plane=name,
-            darks=tuple(e.levels.darks),
+            darks=tuple(evaluation.levels.darks),
             flats=tuple(level for level in main if level.light > 0),
             in_photons=photons,
             wavelength_nm=lamp[2] if photons and isinstance(lamp, tuple) else None,
-            saturation_dn=e.saturation.signal_dn[name],
-            variance_error=e.transfer.model_error,
-            lamp_error=e.light_scatter,
-            spatial=tuple(level for level in e.levels.flats if level.lamp == lamp and level.light > 0),
-            gain_dn_per_e=e.transfer.gain,
+            saturation_dn=evaluation.saturation.signal_dn[name],
+            variance_error=evaluation.transfer.model_error,
+            lamp_error=evaluation.light_scatter,
+            spatial=tuple(level for level in evaluation.levels.flats if level.lamp == lamp and level.light > 0),
+            gain_dn_per_e=evaluation.transfer.gain,
         )
         figures = emva1288_figures(given)
         if isinstance(figures, str):
-            e.remarks.add(f"no EMVA 1288 figures: {figures}")
+            evaluation.remarks.add(f"no EMVA 1288 figures: {figures}")
         else:
             figures_of_plane[name] = figures
     return figures_of_plane
 
 
-def photon_transfer_points(e: Evaluation, deviation: dict[tuple[int, str], float]) -> PhotonTransfer:
+def photon_transfer_points(evaluation: Evaluation, deviation: dict[tuple[int, str], float]) -> PhotonTransfer:
     """Return the points of the plot: flats by channel, means over the planes of the channel."""
-    used = {(id(level), name): bool(flag) for (level, name), flag in zip(e.points, e.transfer.used, strict=True)}
+    used = {
+        (id(level), name): bool(flag)
+        for (level, name), flag in zip(evaluation.points, evaluation.transfer.used, strict=True)
+    }
     rows: list[tuple[str, float, float, float, float, float, bool, float | None]] = []
-    channels = dict.fromkeys(name[0] for name in e.levels.names)
-    for level in e.levels.flats:
+    channels = dict.fromkeys(name[0] for name in evaluation.levels.names)
+    for level in evaluation.levels.flats:
         for channel in channels:
-            names = [name for name in e.levels.names if name[0] == channel and level.repeats > 1]
+            names = [name for name in evaluation.levels.names if name[0] == channel and level.repeats > 1]
             if not names:
                 continue
             planes = [level.plane[name] for name in names]
-            signal = [p.mean - e.dark.mean_dn(n, level.exposure_s) for p, n in zip(planes, names, strict=True)]
-            index = [e.plane_index.get(n) for n in names]
-            floor = [0.0 if i is None else float(e.transfer.floor[i]) for i in index]
+            signal = [p.mean - evaluation.dark.mean_dn(n, level.exposure_s) for p, n in zip(planes, names, strict=True)]
+            index = [evaluation.plane_index.get(n) for n in names]
+            floor = [0.0 if i is None else float(evaluation.transfer.floor[i]) for i in index]
             dark = [
-                f + e.transfer.gain * (e.dark.mean_dn(n, level.exposure_s) - e.dark.lines[n].black)
+                f
+                + evaluation.transfer.gain
+                * (evaluation.dark.mean_dn(n, level.exposure_s) - evaluation.dark.lines[n].black)
                 for f, n in zip(floor, names, strict=True)
             ]
-            variance = [e.levels.pixel_variance_dn2(level, n) - d for n, d in zip(names, dark, strict=True)]
+            variance = [evaluation.levels.pixel_variance_dn2(level, n) - d for n, d in zip(names, dark, strict=True)]
             shares = [deviation[id(level), n] for n in names if (id(level), n) in deviation]
             rows.append(
                 (
@@ -312,38 +328,47 @@ def photon_transfer_points(e: Evaluation, deviation: dict[tuple[int, str], float
     )
 
 
-def remark_on_levels(e: Evaluation) -> None:
+def remark_on_levels(evaluation: Evaluation) -> None:
     """Report saturated and single flats, defects, gain, and planes that differ."""
-    clipped = sum(any(flags) for flags in zip(*e.saturation.clipped.values(), strict=True))
+    clipped = sum(any(flags) for flags in zip(*evaluation.saturation.clipped.values(), strict=True))
     if clipped:
-        e.remarks.add(f"{clipped} of {len(e.levels.flats)} flat levels saturate in a channel: left out there")
-    single = sum(level.repeats < 2 for level in e.levels.flats)
+        evaluation.remarks.add(
+            f"{clipped} of {len(evaluation.levels.flats)} flat levels saturate in a channel: left out there"
+        )
+    single = sum(level.repeats < 2 for level in evaluation.levels.flats)
     if single:
-        e.remarks.add(f"{single} of {len(e.levels.flats)} flat levels have no repeat: only their means are used")
-    if e.levels.defects:
-        e.remarks.add(f"{e.levels.defects} hot or dead pixels stand out of the longest darks: left out of everything")
-    if e.levels.gain_db:
-        e.remarks.add(f"recorded at a gain of {e.levels.gain_db:g} dB: the conversion gain is given for 0 dB")
-    remark_on_planes(e)
+        evaluation.remarks.add(
+            f"{single} of {len(evaluation.levels.flats)} flat levels have no repeat: only their means are used"
+        )
+    if evaluation.levels.defects:
+        evaluation.remarks.add(
+            f"{evaluation.levels.defects} hot or dead pixels stand out of the longest darks: left out of everything"
+        )
+    if evaluation.levels.gain_db:
+        evaluation.remarks.add(
+            f"recorded at a gain of {evaluation.levels.gain_db:g} dB: the conversion gain is given for 0 dB"
+        )
+    remark_on_planes(evaluation)
 
 
-def remark_on_planes(e: Evaluation) -> None:
+def remark_on_planes(evaluation: Evaluation) -> None:
     """Report planes that differ in conversion gain, as read-out channels of their own do."""
     values, weights = [], []
-    for name in e.levels.names:
+    for name in evaluation.levels.names:
         used_flats = [
             (level.plane[name], level)
-            for (level, plane), used in zip(e.points, e.transfer.used, strict=True)
+            for (level, plane), used in zip(evaluation.points, evaluation.transfer.used, strict=True)
             if plane == name and used and level.lamp != "dark"
         ]
-        if not used_flats or e.transfer.by_line:
+        if not used_flats or evaluation.transfer.by_line:
             continue
-        signal = np.array([p.mean - e.dark.lines[name].black for p, _ in used_flats])
-        variance = np.array([e.levels.pixel_variance_dn2(level, name) for _, level in used_flats])
-        excess = variance - e.transfer.floor[e.plane_index[name]]
-        excess -= e.transfer.curvature * signal**2
+        signal = np.array([p.mean - evaluation.dark.lines[name].black for p, _ in used_flats])
+        variance = np.array([evaluation.levels.pixel_variance_dn2(level, name) for _, level in used_flats])
+        excess = variance - evaluation.transfer.floor[evaluation.plane_index[name]]
+        excess -= evaluation.transfer.curvature * signal**2
         weight = (
-            signal / np.hypot([p.temporal_variance_std for p, _ in used_flats], e.transfer.model_error * excess)
+            signal
+            / np.hypot([p.temporal_variance_std for p, _ in used_flats], evaluation.transfer.model_error * excess)
         ) ** 2
         values.append(float(np.sum(weight * excess / signal) / weight.sum()))
         weights.append(float(weight.sum()))
@@ -351,8 +376,8 @@ def remark_on_planes(e: Evaluation) -> None:
         return
     mean = np.average(values, weights=weights)
     if special.chdtrc(len(values) - 1, float(np.sum(np.array(weights) * (np.array(values) - mean) ** 2))) < 1e-4:
-        listed = ", ".join(f"{name} {value:.4g}" for name, value in zip(e.levels.names, values, strict=False))
-        e.remarks.add(f"the planes differ in conversion gain ({listed} DN/e): the one given is their mean")
+        listed = ", ".join(f"{name} {value:.4g}" for name, value in zip(evaluation.levels.names, values, strict=False))
+        evaluation.remarks.add(f"the planes differ in conversion gain ({listed} DN/e): the one given is their mean")
 
 
 # The noise fit of a recording set: darks and flats of one camera, grouped into levels.
@@ -472,10 +497,26 @@ Setting = tuple[str, float, float | None, float | None, float | None]
 
 
 def fit_level_table(file: Path, camera: DataSheet) -> FitResult:
-    """Fit the photon transfer to the table `file`, of a camera whose `cfa`, `bit_depth` and levels `camera` states.
+    r"""Fit the photon transfer to a table of levels, without frames.
+
+    file : CSV, a row a level and channel: `kind` (dark, flat), `exposure_s`, `mean_dn`, `variance_dn2` (temporal, of
+        single pixels), `pixels`, `repeats`; where known `channel`, `photons_per_pixel`, `wavelength_nm`,
+        `temperature_c`
+    camera : its `cfa`, `bit_depth` and levels
 
     Raises InputError with one line where a column is missing or unknown (another unit, above all) or a cell is no
-    number, and `NotDetermined` where the levels don't determine the conversion gain.
+    number, and `NotDetermined` where the levels don't determine the conversion gain. The method: EMVA 1288,
+    `lab.fit.noise`.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> rows = ["kind,exposure_s,mean_dn,variance_dn2,pixels,repeats", "dark,0.001,64,4,1000000,50"]
+    >>> rows += [f"flat,{n / 1000},{64 + 500 * n},{4 + 0.5 * 500 * n},1000000,50" for n in range(1, 8)]
+    >>> camera = DataSheet(rows=1000, cols=1000, cfa="MONO", bit_depth=12)
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = (Path(folder) / "levels.csv").write_text("\n".join(rows))
+    ...     noise = fit_level_table(Path(folder) / "levels.csv", camera).cameras["left"].noise
+    >>> round(noise.conversion_gain_dn_per_e, 3), round(noise.read_noise_e, 2)  # sqrt(4 DN^2 - 1/12) / 0.5 DN/e
+    (0.5, 3.96)
     """
     groups: dict[Setting, dict[str, PlaneStatistics]] = {}
     for row in table_rows(file, NEEDED, KNOWN):

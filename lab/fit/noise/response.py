@@ -18,119 +18,122 @@ from sim.spectrum import FloatArray
 LINEARITY_RANGE = (0.05, 0.95)  # of saturation: range of the linearity line of EMVA 1288
 
 
-def linearity_by_plane(e: Evaluation) -> tuple[dict[str, Linearity], dict[tuple[int, str], float]]:
+def linearity_by_plane(evaluation: Evaluation) -> tuple[dict[str, Linearity], dict[tuple[int, str], float]]:
     """Return the linearity by plane, and the deviation, %, of every (id of level, plane) that has one."""
     lines: dict[str, Linearity] = {}
     deviation: dict[tuple[int, str], float] = {}
-    for name in e.levels.names:
-        chosen = levels_in_range(e, name, *LINEARITY_RANGE)
+    for name in evaluation.levels.names:
+        chosen = levels_in_range(evaluation, name, *LINEARITY_RANGE)
         if len({level.light for level in chosen}) < 4:
             continue
-        lines[name] = _line(e, name, chosen)
+        lines[name] = _line(evaluation, name, chosen)
         for level, percent in zip(chosen, lines[name].deviation_percent, strict=True):
             deviation[id(level), name] = float(percent)
     if not lines:
-        e.remarks.add(
+        evaluation.remarks.add(
             "fewer than four levels of one lamp between 5 and 95 % of saturation: the linearity error isn't determined"
         )
     return lines, deviation
 
 
-def linearity_error(e: Evaluation) -> tuple[float | None, float | None]:
+def linearity_error(evaluation: Evaluation) -> tuple[float | None, float | None]:
     """Return the mean of the planes' linearity errors, %, and its standard deviation.
 
     Planes see the same lamp: where it drifts, their errors are fully correlated. So is always what noise adds to a
     modulus.
     """
-    errors = list(linearity_by_plane(e)[0].values())
+    errors = list(linearity_by_plane(evaluation)[0].values())
     if not errors:
         return None, None
-    independent = 1 if e.light_scatter > 0 else len(errors)
+    independent = 1 if evaluation.light_scatter > 0 else len(errors)
     noise = np.mean([error.error_noise_percent for error in errors]) / np.sqrt(independent)
     bias = np.mean([error.error_bias_percent for error in errors])
     return float(np.mean([error.error_percent for error in errors])), float(np.hypot(noise, bias))
 
 
-def main_lamp_levels(e: Evaluation) -> list[MeasuredLevel]:
+def main_lamp_levels(evaluation: Evaluation) -> list[MeasuredLevel]:
     """Return the flats of the series of the lamp with most levels."""
-    lamps = [level.lamp for level in e.consistency.series]
+    lamps = [level.lamp for level in evaluation.consistency.series]
     lamp = max(dict.fromkeys(lamps), key=lamps.count)
-    return [level for level in e.consistency.series if level.lamp == lamp]
+    return [level for level in evaluation.consistency.series if level.lamp == lamp]
 
 
-def levels_in_range(e: Evaluation, name: str, low: float, high: float) -> list[MeasuredLevel]:
+def levels_in_range(evaluation: Evaluation, name: str, low: float, high: float) -> list[MeasuredLevel]:
     """Return the unsaturated flats of the main lamp with a signal of `low` to `high` of saturation."""
-    clipped = dict(zip(map(id, e.levels.flats), e.saturation.clipped[name], strict=True))
+    clipped = dict(zip(map(id, evaluation.levels.flats), evaluation.saturation.clipped[name], strict=True))
     return [
         level
-        for level in main_lamp_levels(e)
+        for level in main_lamp_levels(evaluation)
         if not clipped[id(level)]
         and low
-        <= (level.plane[name].mean - e.dark.lines[name].at(level.exposure_s)) / e.saturation.signal_dn[name]
+        <= (level.plane[name].mean - evaluation.dark.lines[name].at(level.exposure_s))
+        / evaluation.saturation.signal_dn[name]
         <= high
     ]
 
 
 def response_to_light(
-    e: Evaluation, name: str, levels: Sequence[MeasuredLevel]
+    evaluation: Evaluation, name: str, levels: Sequence[MeasuredLevel]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the light, signal (DN above dark) and its standard deviation, (levels,) each: by noise, and by what the
     levels scatter beyond it; that of the darks isn't in it.
     """
-    signal = np.array([level.plane[name].mean - e.dark.mean_dn(name, level.exposure_s) for level in levels])
+    signal = np.array([level.plane[name].mean - evaluation.dark.mean_dn(name, level.exposure_s) for level in levels])
     noise = np.array([level.plane[name].mean_std for level in levels])
-    shot = e.transfer.gain * np.maximum(signal, 0.0) + e.levels.quantisation_dn2
+    shot = evaluation.transfer.gain * np.maximum(signal, 0.0) + evaluation.levels.quantisation_dn2
     noise = np.where(np.isfinite(noise), noise, np.sqrt(shot / levels[0].plane[name].pixels))
-    beyond = np.maximum(e.light_scatter, [level.light_std for level in levels])
+    beyond = np.maximum(evaluation.light_scatter, [level.light_std for level in levels])
     return np.array([level.light for level in levels]), signal, np.hypot(noise, beyond * signal)
 
 
-def _line(e: Evaluation, name: str, levels: Sequence[MeasuredLevel]) -> Linearity:
-    light, signal, std = response_to_light(e, name, levels)
-    of_darks = e.dark.mean_covariance_dn2(name, [level.exposure_s for level in levels])
+def _line(evaluation: Evaluation, name: str, levels: Sequence[MeasuredLevel]) -> Linearity:
+    light, signal, std = response_to_light(evaluation, name, levels)
+    of_darks = evaluation.dark.mean_covariance_dn2(name, [level.exposure_s for level in levels])
     return linearity(light, signal, np.diag(std**2) + of_darks)
 
 
-def full_well(e: Evaluation) -> tuple[float | None, float | None]:
+def full_well(evaluation: Evaluation) -> tuple[float | None, float | None]:
     """Return the saturation, e, and its standard deviation; None where no flat saturates."""
-    seen = [(value, name) for name, value in e.saturation.seen_dn.items() if value is not None]
+    seen = [(value, name) for name, value in evaluation.saturation.seen_dn.items() if value is not None]
     if not seen:
         highest = max(
-            level.plane[name].mean - e.dark.lines[name].black for level in e.levels.flats for name in e.levels.names
-        ) / (e.levels.white_dn - e.dark.lines[None].black)
-        e.remarks.add(
+            level.plane[name].mean - evaluation.dark.lines[name].black
+            for level in evaluation.levels.flats
+            for name in evaluation.levels.names
+        ) / (evaluation.levels.white_dn - evaluation.dark.lines[None].black)
+        evaluation.remarks.add(
             f"no flat saturates (the brightest reaches {100 * highest:.0f} % of the range): the full well isn't "
             "determined; expose longer"
         )
         return None, None
     value, name = max(seen)
-    limit = e.levels.white_dn - e.dark.lines[name].black
-    if value >= limit - 0.5 * e.levels.step_dn:
-        e.remarks.add(
-            f"saturation is the converter's limit ({e.levels.white_dn:g} DN): full_well_e is the signal there, and "
-            "the pixel may hold more"
+    limit = evaluation.levels.white_dn - evaluation.dark.lines[name].black
+    if value >= limit - 0.5 * evaluation.levels.step_dn:
+        evaluation.remarks.add(
+            f"saturation is the converter's limit ({evaluation.levels.white_dn:g} DN): full_well_e is the signal "
+            "there, and the pixel may hold more"
         )
     # The saturated value is rounded to the step of the codes
-    return in_electrons(e, value, np.sqrt(e.levels.quantisation_dn2))
+    return in_electrons(evaluation, value, np.sqrt(evaluation.levels.quantisation_dn2))
 
 
-def quantum_efficiency(e: Evaluation) -> dict[str, float | None]:
+def quantum_efficiency(evaluation: Evaluation) -> dict[str, float | None]:
     """Return the quantum efficiency of a MONO camera, its standard deviations and wavelength (nm), by EMVA 1288:
     responsivity over K.
 
     The responsivity is the slope of the signal against photons, to 70 % of saturation. Empty without a number of
     photons.
     """
-    levels = main_lamp_levels(e)
+    levels = main_lamp_levels(evaluation)
     lamp = levels[0].lamp
-    if e.levels.camera.cfa != "MONO" or not (isinstance(lamp, tuple) and lamp[1]):
+    if evaluation.levels.camera.cfa != "MONO" or not (isinstance(lamp, tuple) and lamp[1]):
         return {}
-    chosen = levels_in_range(e, "Y", 0.0, LINE_LIMIT)
+    chosen = levels_in_range(evaluation, "Y", 0.0, LINE_LIMIT)
     chosen = [level for level in chosen if level.light > 0]
     if len({level.light for level in chosen}) < 3:
         return {}
-    line = _line(e, "Y", chosen)
-    value, std = in_electrons(e, line.slope, line.slope_std)
+    line = _line(evaluation, "Y", chosen)
+    value, std = in_electrons(evaluation, line.slope, line.slope_std)
     calibration = max(level.light_calibration_std for level in chosen)
     return {
         "quantum_efficiency": value,
@@ -140,18 +143,18 @@ def quantum_efficiency(e: Evaluation) -> dict[str, float | None]:
     }
 
 
-def remark_on_scatter(e: Evaluation) -> None:
+def remark_on_scatter(evaluation: Evaluation) -> None:
     """Report means that differ beyond noise: between the repeats of a level, or else about a smooth response; and
     those of repeated darks, where they differ by more than the noise of a pixel.
 
     Repeats have the same stated light and the same response: what is left is the light itself, or a dark level that
     moves, which the darks show. Levels differ in all of these, so that no cause is named.
     """
-    drift, scatter = e.drift, e.consistency.scatter
-    dark_dn = e.dark_scatter_dn([level for level in e.levels.darks if level.drift is None])
-    pixel_dn = float(np.sqrt(max(float(np.mean(e.transfer.floor)), e.levels.quantisation_dn2)))
+    drift, scatter = evaluation.drift, evaluation.consistency.scatter
+    dark_dn = evaluation.dark_scatter_dn([level for level in evaluation.levels.darks if level.drift is None])
+    pixel_dn = float(np.sqrt(max(float(np.mean(evaluation.transfer.floor)), evaluation.levels.quantisation_dn2)))
     if dark_dn > pixel_dn:
-        e.remarks.add(
+        evaluation.remarks.add(
             f"the means of repeated dark frames differ by {dark_dn:.2g} DN (rms), more than the noise of one pixel, "
             f"{pixel_dn:.2g} DN: frames may be of another exposure or temperature, or the dark level moved; it is in "
             "the uncertainties of black level, read noise and dark current"
@@ -159,20 +162,19 @@ def remark_on_scatter(e: Evaluation) -> None:
     if drift.relative > 0:
         cause = (
             "the dark level moved"
-            if e.dark_drift_dn > 0.5 * drift.std_dn
+            if evaluation.dark_drift_dn > 0.5 * drift.std_dn
             else "the lamp drifted, or the time of exposure varied"
         )
-        e.remarks.add(
+        evaluation.remarks.add(
             f"{cause}: the means of repeated flat frames differ by {drift.std_dn:.2g} DN (rms) where noise explains "
             f"{drift.noise_dn:.2g} DN ({100 * drift.relative:.2g} % of the signal)"
         )
     if scatter > 1.5 * drift.relative:
-        e.remarks.add(
+        evaluation.remarks.add(
             f"the means of the levels scatter by {100 * scatter:.2g} % of the signal about a smooth response, where "
             "noise explains "
-            f"{100 * e.consistency.noise:.1g} %: it is in the uncertainties; a light that varies, exposures or photon "
-            "numbers that are "
-            "stated wrong and a response with steps all do that"
+            f"{100 * evaluation.consistency.noise:.1g} %: it is in the uncertainties; a light that varies, "
+            "exposures or photon numbers that are stated wrong and a response with steps all do that"
         )
 
 
@@ -186,23 +188,23 @@ LARGEST_BEND_STD = 0.5  # of saturation: a bend that is less certain says nothin
 ADJACENT = {"Y": ("Y",), "R": ("G1", "G2"), "B": ("G1", "G2"), "G1": ("R", "B"), "G2": ("R", "B")}
 
 
-def variance_curvature_figures(e: Evaluation) -> dict[str, float]:
+def variance_curvature_figures(evaluation: Evaluation) -> dict[str, float]:
     """Return, in per cent at saturation with standard deviations, the curvature of the response, of the variance, what
     the variance lacks beyond three times that of the response, and the covariance of neighbours. Reports what bends the
     variance. Empty where no level is near saturation (`LEAST_REACH`).
     """
-    t = e.transfer
-    if not e.reaches_saturation:
+    t = evaluation.transfer
+    if not evaluation.reaches_saturation:
         return {}
     figures = {
         "variance_bend_percent": 100.0 * t.relative_curvature,
         "variance_bend_percent_std": 100.0 * t.relative_curvature_std,
     }
-    shared = neighbour_covariance(e)
+    shared = neighbour_covariance(evaluation)
     if shared is not None:
         figures["neighbour_covariance_percent"] = 100.0 * shared[0]
         figures["neighbour_covariance_percent_std"] = 100.0 * shared[1]
-    response = response_curvature(e)
+    response = response_curvature(evaluation)
     if response is None:
         return figures
     figures["response_bend_percent"], figures["response_bend_percent_std"] = 100.0 * response[0], 100.0 * response[1]
@@ -225,32 +227,33 @@ def variance_curvature_figures(e: Evaluation) -> dict[str, float]:
             f"(brighter-fatter, {where})"
         )
     if causes and abs(t.relative_curvature) > 2.0 * t.relative_curvature_std:
-        e.remarks.add(f"at saturation, the variance bends by {' and '.join(causes)}")
+        evaluation.remarks.add(f"at saturation, the variance bends by {' and '.join(causes)}")
     return figures
 
 
-def response_curvature(e: Evaluation) -> tuple[float, float] | None:
+def response_curvature(evaluation: Evaluation) -> tuple[float, float] | None:
     """Return the departure of the response from its slope at zero, relative, at saturation: from means against light,
     all planes together.
 
     x = o + S l + q l^2, with an offset for light that the clock of the exposure doesn't count; the result is q x_sat /
     S^2. None, and a remark, where the means don't follow this law.
     """
-    if e.consistency.scatter > LARGEST_SCATTER:
-        e.remarks.add(
-            f"the levels scatter by {100.0 * e.consistency.scatter:.2g} % of the signal about every smooth response: "
-            "the curvature of the "
-            "response isn't given"
+    if evaluation.consistency.scatter > LARGEST_SCATTER:
+        evaluation.remarks.add(
+            f"the levels scatter by {100.0 * evaluation.consistency.scatter:.2g} % of the signal about every smooth "
+            "response: the curvature of the response isn't given"
         )
         return None
-    values, weights, highest = [], [], max(e.saturation.signal_dn.values())
-    for name in e.levels.names:
-        levels = levels_in_range(e, name, 0.0, CURVE_LIMIT)
+    values, weights, highest = [], [], max(evaluation.saturation.signal_dn.values())
+    for name in evaluation.levels.names:
+        levels = levels_in_range(evaluation, name, 0.0, CURVE_LIMIT)
         if len({level.light for level in levels}) < 5:
             continue
-        light, signal, std = response_to_light(e, name, levels)
+        light, signal, std = response_to_light(evaluation, name, levels)
         # The response depends on all charge, with that of the dark current: as light, below / slope
-        below = np.array([e.dark.mean_dn(name, level.exposure_s) - e.dark.lines[name].black for level in levels])
+        below = np.array(
+            [evaluation.dark.mean_dn(name, level.exposure_s) - evaluation.dark.lines[name].black for level in levels]
+        )
         slope = float(np.sum(light * signal) / np.sum(light * light))
         for _ in range(2):
             charge = light + below / slope
@@ -264,7 +267,7 @@ def response_curvature(e: Evaluation) -> tuple[float, float] | None:
         factor = chi2_factor(chi2, len(levels) - 3)
         covariance *= factor
         if factor > 1.0 and rest > LARGEST_MISFIT * brought:
-            e.remarks.add(
+            evaluation.remarks.add(
                 "the means of the levels don't follow a response that bends like a parabola: they depart from it by "
                 f"{rest:.2g} times "
                 f"their noise, its bend brings {brought:.2g} times; no curvature of the response is given"
@@ -280,7 +283,7 @@ def response_curvature(e: Evaluation) -> tuple[float, float] | None:
     chi2 = float(np.sum(np.array(weights) * (np.array(values) - mean) ** 2))
     mean_std = float(np.sqrt(chi2_factor(chi2, len(values) - 1) / np.sum(weights)))
     if mean_std > LARGEST_BEND_STD:
-        e.remarks.add(
+        evaluation.remarks.add(
             f"the levels leave the curvature of the response uncertain to {100.0 * mean_std:.2g} % at saturation: it "
             "isn't given"
         )
@@ -292,35 +295,37 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def neighbour_covariance(e: Evaluation) -> tuple[float, float] | None:
+def neighbour_covariance(evaluation: Evaluation) -> tuple[float, float] | None:
     """Return the temporal covariance of a pixel with its eight neighbours as a share of the variance of its shot noise,
     at saturation.
 
     4 (adjacent + diagonal) less that of the darks = share K x x_beside / x_sat, x_beside the mean of the planes that
     it adjoins.
     """
-    highest, gain = max(e.saturation.signal_dn.values()), e.transfer.gain
+    highest, gain = max(evaluation.saturation.signal_dn.values()), evaluation.transfer.gain
     rows: list[tuple[float, float, float]] = []
     dark: dict[str, tuple[float, float]] = {}
-    for name in e.levels.names:
-        dark_planes = [level.plane[name] for level in e.levels.darks if np.isfinite(level.plane[name].covariance_std)]
+    for name in evaluation.levels.names:
+        dark_planes = [
+            level.plane[name] for level in evaluation.levels.darks if np.isfinite(level.plane[name].covariance_std)
+        ]
         if dark_planes:
             weight = np.array([1.0 / max(plane.covariance_std, 1e-9) ** 2 for plane in dark_planes])
             both = np.array([4.0 * (plane.adjacent_covariance + plane.diagonal_covariance) for plane in dark_planes])
             dark[name] = float(np.average(both, weights=weight)), float(np.sqrt(32.0 / weight.sum()))
-    for level, name in e.points:
+    for level, name in evaluation.points:
         plane = level.plane[name]
-        signal = plane.mean - e.dark.lines[name].black
+        signal = plane.mean - evaluation.dark.lines[name].black
         if (
             level.lamp == "dark"
             or not np.isfinite(plane.covariance_std)
-            or signal > CURVE_LIMIT * e.saturation.signal_dn[name]
+            or signal > CURVE_LIMIT * evaluation.saturation.signal_dn[name]
         ):
             continue
-        adjacent = [level.plane[n].mean - e.dark.lines[n].black for n in ADJACENT[name]]
-        number = e.levels.flats.index(level)
+        adjacent = [level.plane[n].mean - evaluation.dark.lines[n].black for n in ADJACENT[name]]
+        number = evaluation.levels.flats.index(level)
         if any(
-            e.saturation.clipped[n][number] or value > CURVE_LIMIT * e.saturation.signal_dn[n]
+            evaluation.saturation.clipped[n][number] or value > CURVE_LIMIT * evaluation.saturation.signal_dn[n]
             for n, value in zip(ADJACENT[name], adjacent, strict=True)
         ):
             continue
@@ -337,5 +342,5 @@ def neighbour_covariance(e: Evaluation) -> tuple[float, float] | None:
     product = float(np.sum(x * y / std**2)) / norm
     chi2, freedom = float(np.sum(((y - product * x) / std) ** 2)), len(rows) - 1
     # In a colour mosaic each pair is counted in both its planes
-    counted = 1.0 if e.levels.camera.cfa == "MONO" else 2.0
+    counted = 1.0 if evaluation.levels.camera.cfa == "MONO" else 2.0
     return product, float(np.sqrt(counted * chi2_factor(chi2, freedom) / norm))

@@ -149,9 +149,17 @@ def _row_products(u: Array, v: Array, rows: NDArray[np.int64]) -> Array:
 
 
 def normal_equations_right(sharp: Array, blurred: Array, support: int) -> tuple[Array, float]:
-    """Sum the parts that depend on `blurred`: the right side (support^2,) and the power.
+    """Sum the parts of the normal equations that depend on `blurred`.
 
-    `sharp`, `blurred` (rows, cols): see `normal_equations`.
+    sharp, blurred : (rows, cols)
+    support : rows and columns of the kernel, odd
+
+    Returns the right side (support^2,) and the power.
+
+    >>> sharp = np.random.default_rng(1).random((12, 14))
+    >>> right, power = normal_equations_right(sharp, sharp, 3)
+    >>> bool(np.isclose(right[4], power)), bool(np.isclose(power, np.sum(sharp[1:-1, 1:-1] ** 2)))
+    (True, True)
     """
     s, h = support, support // 2
     tall, wide = sharp.shape[0] - 2 * h, sharp.shape[1] - 2 * h

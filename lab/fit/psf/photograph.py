@@ -51,13 +51,17 @@ def estimate_from_photograph(
     oversample: int = 4,
     corners: ArrayLike | None = None,
 ) -> PhotographedKernel:
-    """Estimate the kernel from a single photograph (rows, cols), linear, one channel, of a printed or shown `pattern`
-    (0 dark, 1 lit).
+    """Estimate the kernel from a single photograph of a printed or shown pattern.
 
-    Dark level and contrast are planes in the frame, fitted with the kernel. The place is found by the pattern itself:
-    where the picture has most fine structure, in any quarter turn; or at `corners` (4, 2), (x, y) of the corners of
-    the pattern, clockwise from its own top left. Then homography, cubic displacement and kernel in turn. Raises
-    `NotDetermined` where the pattern isn't seen.
+    photo : (rows, cols), linear, one channel
+    pattern : cells (rows, cols), 0 dark, 1 lit
+    support_px : rows and columns of the kernel, odd
+    oversample : samples of the kernel in a pixel
+    corners : (4, 2), (x, y) of the corners of the pattern, clockwise from its own top left; by default the place where
+        the picture has most fine structure, in any quarter turn
+
+    Dark level and contrast are planes in the frame, fitted with the kernel; then homography, cubic displacement and
+    kernel in turn. Raises `NotDetermined` where the pattern isn't seen.
     """
     seen, target = np.asarray(photo, dtype=float), np.asarray(pattern, dtype=np.uint8)
     if seen.ndim != 2 or target.ndim != 2 or not np.isfinite(seen).all():

@@ -159,7 +159,7 @@ class DrawnPattern:
             )
         return DrawnPattern(warp, picture, surroundings, row, col, seen[row, col], support, oversample)
 
-    def parts(self, count: int) -> list[DrawnPattern]:
+    def split(self, count: int) -> list[DrawnPattern]:
         """Split the pattern into `count` x `count` parts of about equal rows and columns, without parts of too few
         pixels.
         """
@@ -307,7 +307,7 @@ def measure_field(
         if channel == reference and patches > 1:
             local = [
                 screen_kernel(part, channel, solve_kernel(part.normal(), part.support, outside=True, prior_of=whole))
-                for part in drawn.parts(patches)
+                for part in drawn.split(patches)
             ]
     return ScreenField({channel: kernel_of_channel[channel] for channel in places}, tuple(local))
 

@@ -71,7 +71,15 @@ def smooth_root(wave: FloatArray, roughness: FloatArray) -> FloatArray:
 
 
 def rough_root(wave: FloatArray, roughness: FloatArray, fine_share: float) -> FloatArray:
-    """Return the root (m, m) of `smooth_root` with fine structure added (`fine_covariance`)."""
+    """Return the root (m, m) of `smooth_root` with fine structure added (`fine_covariance`).
+
+    wave, roughness : wavelengths, nm, and standard deviations of the second difference, (m,)
+    fine_share : see `fine_covariance`; 0: none
+
+    >>> wave = np.arange(400.0, 450.0, 10.0)
+    >>> bool(np.allclose(rough_root(wave, np.ones(5), 0.0), smooth_root(wave, np.ones(5))))
+    True
+    """
     smooth = smooth_root(wave, roughness)
     if fine_share == 0.0:
         return smooth
@@ -98,7 +106,14 @@ def signal_covariance(wave: FloatArray, operator: FloatArray, roughness: FloatAr
     """Return the covariance (n, n) of the signals `operator` S of curves S with the prior of `rough_root`, up to
     straight lines.
 
-    `operator` (n, m); `roughness`, `fine_share`: see `rough_root`.
+    wave, roughness : wavelengths, nm, and standard deviations of the second difference, (m,)
+    operator : (n, m)
+    fine_share : see `fine_covariance`
+
+    >>> wave, operator = np.arange(400.0, 450.0, 10.0), np.ones((2, 5))
+    >>> covariance = signal_covariance(wave, operator, np.ones(5), 0.0)
+    >>> bool(np.isclose(covariance[0, 0], covariance[0, 1]))  # one light twice
+    True
     """
     smooth = operator @ smooth_root(wave, roughness)
     covariance = smooth @ smooth.T
@@ -151,10 +166,20 @@ def likeliest_prior(
     shapes: Sequence[FloatArray],
     fine_share: float = 0.0,
 ) -> CurvePrior:
-    """Choose, of the prior roughnesses `shapes`, (m,) each, the one with the largest marginal likelihood at its best
-    strength, for value = operator S + noise, straight lines free.
+    """Choose, of several prior roughnesses, the one with the largest marginal likelihood at its best strength.
 
-    `operator` (n, m), `value`, `std` (n,) of the signals; `fine_share`: see `fine_covariance`.
+    wave : wavelengths (m,), nm
+    operator : (n, m); value = operator S + noise, straight lines free
+    value, std : signals and their standard deviations, (n,)
+    shapes : the roughnesses, (m,) each
+    fine_share : see `fine_covariance`
+
+    >>> wave = np.arange(400.0, 701.0, 10.0)
+    >>> low, high = np.where(wave < 550.0, 1.0, 0.01), np.where(wave < 550.0, 0.01, 1.0)
+    >>> value = np.exp(-0.5 * ((wave - 450.0) / 20.0) ** 2)
+    >>> prior = likeliest_prior(wave, np.eye(31), value, np.full(31, 1e-3), [low, high])
+    >>> bool(np.array_equal(prior.shape, low))
+    True
     """
     line = operator @ straight_lines(wave)
     misfits = [least_misfit(signal_covariance(wave, operator, s, fine_share), line, value, std) for s in shapes]
@@ -165,9 +190,19 @@ def likeliest_prior(
 def posterior_under_prior(
     wave: FloatArray, operator: FloatArray, value: FloatArray, std: FloatArray, prior: CurvePrior
 ) -> CurvePosterior:
-    """Return the posterior of S with value = operator S + noise under `prior`, straight lines free.
+    """Return the posterior of S with value = operator S + noise under a prior, straight lines free.
 
-    `operator` (n, m), `value`, `std` (n,) of the signals.
+    wave : wavelengths (m,), nm
+    operator : (n, m)
+    value, std : signals and their standard deviations, (n,)
+    prior : roughness and strength of the curve
+
+    >>> wave = np.arange(400.0, 701.0, 10.0)
+    >>> value = 0.5 + 0.001 * (wave - 550.0)  # a straight line
+    >>> prior = CurvePrior(np.ones(31), 1e-6, 0.0)
+    >>> posterior = posterior_under_prior(wave, np.eye(31), value, np.full(31, 1e-3), prior)
+    >>> bool(np.allclose(posterior.mean, value, atol=1e-6))
+    True
     """
     line = straight_lines(wave)
     rough = rough_root(wave, prior.shape, prior.fine_share)

@@ -164,11 +164,14 @@ class _MeasuredLine:
 
 
 def fit_mean_table(file: Path, camera: DataSheet) -> FitResult:
-    """Fit the relative sensitivities of all channels to the table `file`, of a camera whose `cfa`, `bit_depth` and
-    levels `camera` states.
+    """Fit the relative sensitivities of all channels to a table of means, without frames.
+
+    file : CSV, a row a light and channel: `kind` (dark, narrowband), `exposure_s`, `mean_dn`, `mean_std_dn`,
+        `wavelength_nm`, `bandwidth_nm`, and the light's power
+    camera : its `cfa`, `bit_depth` and levels
 
     Raises InputError with one line where a column is missing or unknown (another unit, above all) or a cell is no
-    number, and `NotDetermined` where a channel has fewer than three lights.
+    number, and `NotDetermined` where a channel has fewer than three lights. The method: `lab.fit.spectral`.
     """
     rows = table_rows(file, NEEDED, KNOWN)
     darks = [row for row in rows if row.cells["kind"] == "dark"]
@@ -335,7 +338,7 @@ def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Tabl
 
 
 def _fit_curves(lights: Sequence[_TableLight], channels: Sequence[str], remarks: list[str]) -> SpectralFit:
-    """Fit the curves of `channels` to the lights; `remarks` gets what is to be told. Raises `NotDetermined`."""
+    """Fit the curves of `channels` to the lights; `remarks` gets what is to be reported. Raises `NotDetermined`."""
     by_channel = {c: [light for light in lights if light.channel == c] for c in channels}
     for channel, channel_lights in by_channel.items():
         if len({light.wavelength_nm for light in channel_lights}) < MIN_SPECTRA:

@@ -105,6 +105,11 @@ class ChannelSignals:
 def light_errors(signals: Mapping[str, ChannelSignals]) -> dict[str, FloatArray]:
     """Return the changes (n, lights) of each channel's signals by the relative errors of all lights, which the channels
     share.
+
+    >>> none = np.zeros((0, 3)), np.zeros(0)
+    >>> signal = ChannelSignals(np.eye(2, 3), np.array([5.0, 7.0]), np.ones(2), ("400", "500"), *none)
+    >>> light_errors({"G": signal})["G"].tolist()
+    [[5.0, 0.0], [0.0, 7.0]]
     """
     lights = np.array(
         list(dict.fromkeys(name for channel_signals in signals.values() for name in channel_signals.light))
@@ -214,7 +219,11 @@ def _least(loss: Callable[[FloatArray], float], start: FloatArray) -> tuple[floa
 
 
 def scatter_remarks(scatter: Scatter) -> list[str]:
-    """Say in a line what scatter there is, where it is clear."""
+    """Return a line on the scatter of the signals beyond their stated standard deviations, where it is clear.
+
+    >>> scatter_remarks(Scatter())
+    []
+    """
     if scatter.log_ratio < CLEAR_LOG_RATIO:
         return []
     shares = [

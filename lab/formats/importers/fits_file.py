@@ -89,7 +89,11 @@ class FitsHeader:
 
 
 def is_fits(file: Path) -> bool:
-    """Return whether a file is a FITS file by its ending, `.fits.gz` and `.fits.fz` included."""
+    """Return whether a file is a FITS file by its ending, `.fits.gz` and `.fits.fz` included.
+
+    >>> is_fits(Path("flat-1.fits.fz")), is_fits(Path("flat-1.tif"))
+    (True, False)
+    """
     return unpacked_name(file.name).lower().endswith(FITS)
 
 

@@ -45,7 +45,11 @@ def read_image(file: Path, page: int | None = None) -> Frame:
 
 
 def is_frame(file: Path) -> bool:
-    """Return whether a file is one that can be read as a frame, by its ending."""
+    """Return whether a file is one that can be read as a frame, by its ending.
+
+    >>> is_frame(Path("flat-1.dng")), is_frame(Path("notes.txt"))
+    (True, False)
+    """
     return file.suffix.lower() in (*IMAGES, *RAWS, ".npy") or is_fits(file)
 
 
@@ -134,8 +138,18 @@ class ImageFiles(FolderFiles):
 
 
 def read_sides(file: Path) -> dict[Side, dict[str, Any]]:
-    """Return what `camera.toml` says of each side: its keys at the top are of a single (left) camera, or of every side
-    where it has the tables `[left]` and `[right]`. A missing file says nothing of the left one."""
+    r"""Return what `camera.toml` states of each side.
+
+    file : its keys at the top are of a single (left) camera, or of every side where it has the tables `[left]` and
+        `[right]`; a missing file states nothing of the left one
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "camera.toml"
+    ...     _ = file.write_text('cfa = "RGGB"\n[left]\nrows = 480\n[right]\nrows = 960\n')
+    ...     read_sides(file)["right"]
+    {'cfa': 'RGGB', 'rows': 960}
+    """
     written: dict[str, Any] = {}
     if file.is_file():
         try:
@@ -249,7 +263,16 @@ class TapFiles(ImageFiles):
 
 
 def parse_taps(listed: Any, where: str) -> tuple[Tap, ...]:
-    """Return the taps that `[[taps]]` of a camera file lists, checked."""
+    """Return the taps that `[[taps]]` of a camera file lists, checked.
+
+    listed : tables with `name`, `region` and `overscan`
+    where : beginning of the message
+
+    Raises InputError for a table that isn't a tap, and for a name that two have.
+
+    >>> parse_taps([{"name": "A", "region": [0, 0, 10, 10]}], "camera.toml")[0].name
+    'A'
+    """
     try:
         taps = tuple(Tap.model_validate(item) for item in listed)
     except (ValidationError, TypeError) as error:

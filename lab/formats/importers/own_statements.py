@@ -124,7 +124,15 @@ def read_known_keys(file: Path, shape: tuple[int, int], ignored: Collection[str]
 
 
 def list_keys_taken(stated: Collection[str], known: Mapping[str, Any], file: Path) -> list[str]:
-    """Return the line for keys of a camera that aren't `stated` and that its first frame's file has (`known`)."""
+    """Return the line for keys of a camera that nobody states and that its first frame's file has.
+
+    stated : keys that somebody states
+    known : of the file, as `read_known_keys` returns them
+    file : the frame's
+
+    >>> len(list_keys_taken([], {"cfa": "RGGB"}, Path("flat-1.dng")))
+    1
+    """
     taken = [f"{key} = {_text(value)}" for key, value in known.items() if key not in stated]
     return [f"{file}: {', '.join(taken)}: not stated, and taken from this file"] if taken else []
 

@@ -71,10 +71,20 @@ class Index:
 
 
 def read_index(file: Path, needed: tuple[str, ...] = ("frame", "kind")) -> Index:
-    """Return the rows of `file`, whose header has the columns `needed`; cells without blanks, empty ones left out.
+    r"""Return the rows of an index of frames; cells without blanks, empty ones left out.
+
+    file : CSV with a header
+    needed : columns that it must have
 
     Raises InputError with one line where it can't be read, a column is missing, or one that isn't known is a known one
     in another unit or misspelled. Other unknown columns are left out with a remark.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "index.csv"
+    ...     _ = file.write_text("frame,kind,exposure_s\nflat-1.tif,flat,0.01\n")
+    ...     read_index(file).rows
+    [(2, {'frame': 'flat-1.tif', 'kind': 'flat', 'exposure_s': '0.01'})]
     """
     wanted = ",".join(dict.fromkeys((*needed, "side", "exposure_s")))
     if not file.is_file():
@@ -462,7 +472,7 @@ def _pages(file: Path) -> int:
 
 
 def _by_row(lines: Sequence[str], numbers: Sequence[int]) -> list[str]:
-    """Lines on captures as lines on their rows, one for all rows of which the same is said."""
+    """Lines on captures as lines on their rows, one for all rows that share a text."""
     rows_of_line: dict[tuple[str, str], list[str]] = {}
     for line in lines:
         parts = re.fullmatch(r"(.*: )captures\[(\d+)\]( \(.*?\))?(: .*)", line, re.S)

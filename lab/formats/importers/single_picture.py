@@ -408,6 +408,16 @@ def build_recording_set(
     notes: tuple[str, ...],
     spectra: dict[str, Spectrum],
 ) -> RecordingSet:
+    """Return a recording set of one picture.
+
+    path : the picture
+    frame : (rows, cols), DN
+    camera : its data sheet
+    options : as they were stated on the command line
+    capture : keys of the capture
+    notes : remarks of the import
+    spectra : by the path under which the capture names them
+    """
     stored = f"frames/{capture['id']}.npy"
     manifest = Manifest.model_validate(
         {

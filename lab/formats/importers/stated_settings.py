@@ -1,4 +1,4 @@
-"""What is stated of the frames' settings, held against limits, the frames' own files and the times between them.
+"""What is stated of the frames' settings, compared with limits, the frames' own files and the times between them.
 
 A contradiction is one line with the file and both values. Three of them can't be anything but a slip and are refused:
 an exposure that no frame has, one that is off by a unit, and rows that fit their frames when all are moved by one."""
@@ -172,7 +172,7 @@ def _of_tiff(stream: Any) -> FrameHeader | None:
 
 
 def _camera(tags: Mapping[str, Any]) -> InstrumentSnapshot | None:
-    """Return the camera that EXIF names, with what else it says of its settings; None where it names none."""
+    """Return the camera that EXIF names, with its settings as EXIF states them; None where it names none."""
     maker, model, serial = (_text(tags.get(name)) for name in ("Make", "Model", "BodySerialNumber"))
     if not (maker or model or serial):
         return None
@@ -221,7 +221,7 @@ def _exif_of_png(data: bytes) -> bytes | None:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """The library's remarks on a directory without a picture, as EXIF is, aren't told."""
+    """Drop the library's remarks on a directory without a picture, as EXIF is."""
     log = logging.getLogger("tifffile")
     before, log.disabled = log.disabled, True
     try:

@@ -81,24 +81,24 @@ def exchanged_kinds(levels: Sequence[FrameLevel], camera: DataSheet) -> tuple[li
             continue
         d, f = np.unravel_index(int(np.argmax(np.where(wrong, above, -np.inf))), above.shape)
         dark, flat = darks[d], flats[f]
-        told = (
+        sentence = (
             f"{dark.where}: a dark of {dark.exposure_s:g} s has {dark.mean_dn:.4g} DN, and the flat {flat.id} of "
             f"{flat.exposure_s:g} s has "
             f"{flat.mean_dn:.4g} DN"
         )
         if wrong.sum() > MOST_PAIRS * alike.sum():
             problems.append(
-                f"{told}, as {wrong.sum()} of {alike.sum()} pairs do: darks and flats are exchanged; correct their "
+                f"{sentence}, as {wrong.sum()} of {alike.sum()} pairs do: darks and flats are exchanged; correct their "
                 "kinds"
             )
             continue
         lit = wrong.sum(axis=1) > MOST_PAIRS * np.maximum(alike.sum(axis=1), 1)
         if lit.any():
-            names = [one.id for one, is_lit in zip(darks, lit, strict=True) if is_lit]
+            names = [dark_level.id for dark_level, is_lit in zip(darks, lit, strict=True) if is_lit]
             more = f" and {len(names) - 3} more" if len(names) > 3 else ""
             warnings.append(
-                f"{told}: light in {len(names)} of {len(darks)} darks ({', '.join(names[:3])}{more}); correct their "
-                "kind or take them out"
+                f"{sentence}: light in {len(names)} of {len(darks)} darks ({', '.join(names[:3])}{more}); correct "
+                "their kind or take them out"
             )
     return problems, warnings
 
@@ -112,20 +112,25 @@ def _comparable(dark: FrameLevel, flat: FrameLevel) -> bool:
 
 
 def moved_rows(levels: Sequence[FrameLevel]) -> Iterator[str]:
-    """One line for each series of darks and flats whose frames fit the lights of the rows beside them, from one row on
-    to the end.
+    """Yield a line for each series of darks and flats whose frames fit the lights of the rows beside them, from a row
+    on.
 
-    `levels` in the order of their rows, darks with a light of 0. Means are fitted by a line in the light, as listed and
-    with the frames of the last rows moved by one. Series whose light grows by equal steps or factors fit either way
-    without darks and repeats; nothing is told of them."""
+    levels : in the order of their rows, darks with a light of 0
+
+    Means are fitted by a line in the light, as listed and with the frames of the last rows moved by one. Series whose
+    light grows by equal steps or factors fit either way without darks and repeats; nothing is reported of them.
+
+    >>> list(moved_rows([]))
+    []
+    """
     for gain_db, scale in dict.fromkeys((level.gain_db, level.scale) for level in levels if level.scale is not None):
-        own = [
+        lit_levels = [
             level
             for level in levels
             if level.gain_db == gain_db and level.scale in (scale, None) and not level.is_clipped
         ]
-        light, mean = np.array([level.light for level in own]), np.array([level.mean_dn for level in own])
-        if len(own) < FEWEST_ROWS or np.ptp(light) == 0 or np.ptp(mean) == 0:
+        light, mean = np.array([level.light for level in lit_levels]), np.array([level.mean_dn for level in lit_levels])
+        if len(lit_levels) < FEWEST_ROWS or np.ptp(light) == 0 or np.ptp(mean) == 0:
             continue
         light, mean = light / np.ptp(light), mean / np.ptp(mean)
         before = float(_departures(light, mean, light, mean)[-1])
@@ -136,7 +141,7 @@ def moved_rows(levels: Sequence[FrameLevel]) -> Iterator[str]:
             enough = np.append(enough, False)
             start = int(np.argmin(np.where(enough, after, np.inf)))
             if enough[start] and before > LEAST_DEPARTURE and after[start] < BETTER * before:
-                level = own[start + first]
+                level = lit_levels[start + first]
                 yield (
                     f"{level.where}: from this row on, frames have the levels of the rows {where} theirs (departures "
                     "from a line in the light "
@@ -240,8 +245,12 @@ def flat_level(recordings: RecordingSet, flat: FlatCapture, clipped: dict[str, f
     light, scale = _light(recordings, flat)
     camera, codes = recordings.camera(flat.side), recordings.codes(flat)
     cells = codes.channels(camera.cfa)
-    mean_dn = {name: float(np.mean([one.mean_dn for one in own])) for name, own in cells.items()}
-    scatter_dn = {name: float(np.mean([one.std_dn for one in own])) for name, own in cells.items()}
+    mean_dn = {
+        name: float(np.mean([codes_of_plane.mean_dn for codes_of_plane in planes])) for name, planes in cells.items()
+    }
+    scatter_dn = {
+        name: float(np.mean([codes_of_plane.std_dn for codes_of_plane in planes])) for name, planes in cells.items()
+    }
     where = f"{recordings.where(flat.frame)} (capture {flat.id})"
     return ClippedLevel(flat.id, where, flat.gain_db, light, scale, mean_dn, clipped, scatter_dn)
 
@@ -253,19 +262,22 @@ def _why_not_series_end(level: ClippedLevel, channel: str, levels: list[ClippedL
     unclipped levels of the same gain and light lie below it, their slope predicts that it clips, and its repeats clip
     too."""
     unclipped = [
-        other
-        for other in levels
-        if (other.gain_db, other.scale) == (level.gain_db, level.scale) and other.clipped[channel] <= CLIPPED_LIMIT
+        flat
+        for flat in levels
+        if (flat.gain_db, flat.scale) == (level.gain_db, level.scale) and flat.clipped[channel] <= CLIPPED_LIMIT
     ]
     wrong = {*map(id, contradicting_levels(unclipped, channel, black)), *_bent_levels(unclipped, channel)}
-    unclipped = [other for other in unclipped if id(other) not in wrong]
-    for other in unclipped:
-        if other.light >= level.light and other.clipped[channel] < CLIPPED_LIMIT / 5:
-            return f"but {other.id} with as much light isn't; recapture it"
-    below = sorted((other for other in unclipped if 0 < other.light < level.light), key=lambda other: other.light)
-    if len({other.light for other in below}) < SERIES_LEVELS:
+    unclipped = [flat for flat in unclipped if id(flat) not in wrong]
+    for flat in unclipped:
+        if flat.light >= level.light and flat.clipped[channel] < CLIPPED_LIMIT / 5:
+            return f"but {flat.id} with as much light isn't; recapture it"
+    below = sorted(
+        (flat for flat in unclipped if 0 < flat.light < level.light),
+        key=lambda flat: flat.light,
+    )
+    if len({flat.light for flat in below}) < SERIES_LEVELS:
         return f"expose shorter, or add {SERIES_LEVELS} unsaturated levels below it"
-    slope = float(np.median([(other.mean_dn[channel] - black) / other.light for other in below[-SERIES_LEVELS:]]))
+    slope = float(np.median([(flat.mean_dn[channel] - black) / flat.light for flat in below[-SERIES_LEVELS:]]))
     if slope * level.light < LEAST_PREDICTED * (level.mean_dn[channel] - black):
         return f"but the flats below it predict {black + slope * level.light:.0f} DN; recapture it"
     return None
@@ -283,9 +295,9 @@ def contradicting_levels(unclipped: list[ClippedLevel], channel: str, black: flo
     """
     bent = _bent_levels(unclipped, channel)
     signals: dict[float, float] = {}
-    for other in unclipped:
-        if other.light > 0 and id(other) not in bent:
-            signals.setdefault(other.light, other.mean_dn[channel])
+    for flat in unclipped:
+        if flat.light > 0 and id(flat) not in bent:
+            signals.setdefault(flat.light, flat.mean_dn[channel])
     light, mean = np.array(list(signals)), np.array(list(signals.values()))
     if light.size < 1 / WRONG_SHARE:
         return []
@@ -296,33 +308,36 @@ def contradicting_levels(unclipped: list[ClippedLevel], channel: str, black: flo
         return []
     span = float(np.ptp(mean))
     off = [
-        other
-        for other in unclipped
-        if other.light > 0
-        and not (id(other) in bent and other.mean_dn[channel] < offset + slope * other.light)
-        and abs(other.mean_dn[channel] - offset - slope * other.light)
-        > max((1.0 - 1.0 / WRONG_FACTOR) * max(slope * other.light, other.mean_dn[channel] - offset), 0.1 * span)
+        flat
+        for flat in unclipped
+        if flat.light > 0
+        and not (id(flat) in bent and flat.mean_dn[channel] < offset + slope * flat.light)
+        and abs(flat.mean_dn[channel] - offset - slope * flat.light)
+        > max(
+            (1.0 - 1.0 / WRONG_FACTOR) * max(slope * flat.light, flat.mean_dn[channel] - offset),
+            0.1 * span,
+        )
     ]
-    return off if len({other.light for other in off}) <= WRONG_SHARE * light.size else []
+    return off if len({flat.light for flat in off}) <= WRONG_SHARE * light.size else []
 
 
 def _bent_levels(levels: list[ClippedLevel], channel: str) -> set[int]:
     """Ids of the levels of one gain and light at or beyond the bend at the top of the response."""
-    found: set[int] = set()
+    bent: set[int] = set()
     greatest = 0.0
     for level in sorted(levels, key=lambda level: level.mean_dn[channel]):
         if level.scatter_dn[channel] < BENT_SCATTER * greatest:
-            found.add(id(level))
+            bent.add(id(level))
         greatest = max(greatest, level.scatter_dn[channel])
-    return found
+    return bent
 
 
 def wrong_lights(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]:
     """One line for each level of flats whose stated light contradicts the others."""
     for key in dict.fromkeys((level.gain_db, level.scale) for level in levels):
-        own = [level for level in levels if (level.gain_db, level.scale) == key]
-        for channel in own[0].clipped:
-            unclipped = [level for level in own if level.clipped[channel] <= CLIPPED_LIMIT]
+        levels_of_light = [level for level in levels if (level.gain_db, level.scale) == key]
+        for channel in levels_of_light[0].clipped:
+            unclipped = [level for level in levels_of_light if level.clipped[channel] <= CLIPPED_LIMIT]
             off = contradicting_levels(unclipped, channel, camera.black_level_dn or 0.0)
             for of in _by_light(off):
                 yield (
@@ -344,15 +359,15 @@ def wrong_lights(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]
 
 def _by_light(levels: list[ClippedLevel]) -> list[list[ClippedLevel]]:
     """Levels of one light together, the first in the set first."""
-    found: list[list[ClippedLevel]] = []
+    groups: list[list[ClippedLevel]] = []
     for level in levels:
-        for of in found:
+        for of in groups:
             if abs(of[0].light - level.light) <= SAME_LIGHT * of[0].light:
                 of.append(level)
                 break
         else:
-            found.append([level])
-    return found
+            groups.append([level])
+    return groups
 
 
 def saturated_flats(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]:
@@ -437,7 +452,7 @@ def _camera_problems(camera: DataSheet) -> Iterator[str]:
             )
 
 
-def _check_frames(recordings: RecordingSet, found: Findings, loaded: Loaded) -> None:
+def _check_frames(recordings: RecordingSet, findings: Findings, loaded: Loaded) -> None:
     """Load every frame once and hand it to `loaded`; find damaged frames, saturated flats, clipped captures, and darks
     and flats whose levels contradict their kind or their place."""
     flats: dict[Side, list[ClippedLevel]] = defaultdict(list)
@@ -447,9 +462,9 @@ def _check_frames(recordings: RecordingSet, found: Findings, loaded: Loaded) -> 
     for number, capture in enumerate(captures, start=1):
         camera = recordings.manifest.cameras[capture.side]
         try:
-            frame = recordings.frame(capture)
+            frame = recordings.whole_frame(capture)
         except InputError as error:
-            found.problems.append(str(error))
+            findings.problems.append(str(error))
             continue
         loaded(capture, frame, number / len(captures))
         if isinstance(capture, DarkCapture):
@@ -468,14 +483,14 @@ def _check_frames(recordings: RecordingSet, found: Findings, loaded: Loaded) -> 
         elif max(clipped.values()) > CLIPPED_LIMIT:
             clipped_of[capture.side, capture.kind].append(capture.id)
     for side, of_flats in flats.items():
-        found.problems += saturated_flats(of_flats, recordings.manifest.cameras[side])
-        found.warnings += wrong_lights(of_flats, recordings.manifest.cameras[side])
+        findings.problems += saturated_flats(of_flats, recordings.manifest.cameras[side])
+        findings.warnings += wrong_lights(of_flats, recordings.manifest.cameras[side])
     for side, of_frames in levels.items():
         problems, warnings = exchanged_kinds(of_frames, recordings.manifest.cameras[side])
-        found.problems += problems
-        found.warnings += [*warnings, *([] if problems else moved_rows(of_frames))]
+        findings.problems += problems
+        findings.warnings += [*warnings, *([] if problems else moved_rows(of_frames))]
     for (side, kind), ids in clipped_of.items():
-        found.warnings.append(
+        findings.warnings.append(
             f"{recordings.source}: {len(ids)} {kind} captures of the {side} camera have a channel clipped "
             f"({_some(ids)}); "
             "what a clipped channel saw is not used; expose shorter"
@@ -497,16 +512,16 @@ def _frame_level(
     )
 
 
-def _check_cameras(recordings: RecordingSet, found: Findings) -> None:
+def _check_cameras(recordings: RecordingSet, findings: Findings) -> None:
     for side, camera in recordings.manifest.cameras.items():
         where = f"{recordings.source}: camera {side}"
-        found.warnings += _unknown_keys(where, camera)
-        found.problems += [f"{where}: {problem}" for problem in _camera_problems(camera)]
+        findings.warnings += _unknown_keys(where, camera)
+        findings.problems += [f"{where}: {problem}" for problem in _camera_problems(camera)]
         if camera.lens_file is not None:
             try:
                 recordings.file(camera.lens_file)
             except InputError as error:
-                found.problems.append(f"{recordings.where(camera.lens_file)} (lens_file of camera {side}): {error}")
+                findings.problems.append(f"{recordings.where(camera.lens_file)} (lens_file of camera {side}): {error}")
 
 
 def _improbable_values(capture: Capture) -> Iterator[str]:
@@ -520,26 +535,28 @@ def _improbable_values(capture: Capture) -> Iterator[str]:
             yield line
 
 
-def _check_captures(recordings: RecordingSet, found: Findings) -> None:
+def _check_captures(recordings: RecordingSet, findings: Findings) -> None:
     manifest, source = recordings.manifest, recordings.source
     for id, count in Counter(capture.id for capture in manifest.captures).items():
         if count > 1:
-            found.problems.append(f"{source}: capture id '{id}' is used {count} times; give every capture its own")
+            findings.problems.append(f"{source}: capture id '{id}' is used {count} times; give every capture its own")
     framed: dict[str, Capture] = {}
     remarked: dict[str, list[str]] = {}
     for capture in manifest.captures:
         where = f"{source}: capture {capture.id}"
-        found.warnings += _unknown_keys(where, capture)
+        findings.warnings += _unknown_keys(where, capture)
         camera = manifest.cameras[capture.side]
-        found.problems += [f"{where}: {text}" for text in capture.problems(camera.rows, camera.cols)]
+        findings.problems += [f"{where}: {text}" for text in capture.problems(camera.rows, camera.cols)]
         for text in (*capture.remarks(), *_improbable_values(capture)):
             remarked.setdefault(text, []).append(capture.id)
         first = framed.setdefault(capture.frame, capture)
         if first is not capture and not capture.shares_frame:
-            found.warnings.append(f"{where}: its frame is that of {first.id} too, so it is no repeat; check the path")
+            findings.warnings.append(
+                f"{where}: its frame is that of {first.id} too, so it is no repeat; check the path"
+            )
     for text, ids in remarked.items():
         what = f"capture {ids[0]}" if len(ids) == 1 else f"{len(ids)} captures ({_some(ids)})"
-        found.warnings.append(f"{source}: {what}: {text}")
+        findings.warnings.append(f"{source}: {what}: {text}")
 
 
 def _some(ids: Sequence[str]) -> str:
@@ -547,7 +564,7 @@ def _some(ids: Sequence[str]) -> str:
     return ", ".join(ids[:3]) + (f" .. {ids[-1]}" if len(ids) > 3 else "")
 
 
-def _check_spectra_and_targets(recordings: RecordingSet, found: Findings) -> None:
+def _check_spectra_and_targets(recordings: RecordingSet, findings: Findings) -> None:
     manifest = recordings.manifest
     efficiencies = {
         path: f"quantum_efficiency {channel} of camera {side}"
@@ -566,21 +583,21 @@ def _check_spectra_and_targets(recordings: RecordingSet, found: Findings) -> Non
         try:
             lowest, highest = min(value := recordings.spectrum(path).value), max(value)
         except InputError as error:
-            found.problems.append(f"{where}: {error.__cause__}")
+            findings.problems.append(f"{where}: {error.__cause__}")
             continue
         if user.startswith("quantum_efficiency") and not 0 <= lowest <= highest <= 1:
-            found.problems.append(
+            findings.problems.append(
                 f"{where}: {lowest:g}..{highest:g} isn't a quantum efficiency of 0..1 electrons a photon; "
                 "divide percent by 100"
             )
         elif not user.startswith("quantum_efficiency") and highest <= 0:
-            found.warnings.append(f"{where}: no light at any wavelength; was the shutter open?")
-    found.warnings += _lights_off_their_names(recordings)
+            findings.warnings.append(f"{where}: no light at any wavelength; was the shutter open?")
+    findings.warnings += _lights_off_their_names(recordings)
     for path, user in targets.items():
         try:
             recordings.target(path)
         except InputError as error:
-            found.problems.append(f"{recordings.where(path)} ({user}): {error.__cause__}")
+            findings.problems.append(f"{recordings.where(path)} ({user}): {error.__cause__}")
 
 
 def _lights_off_their_names(recordings: RecordingSet) -> Iterator[str]:
@@ -615,9 +632,9 @@ def inspect(recordings: RecordingSet, loaded: Loaded = _not_used) -> tuple[list[
 
     Every frame, spectrum and target is read once; frames are handed to `loaded`.
     """
-    found = Findings(warnings=list(_unknown_keys(f"{recordings.source}: manifest", recordings.manifest)))
-    _check_cameras(recordings, found)
-    _check_captures(recordings, found)
-    _check_spectra_and_targets(recordings, found)
-    _check_frames(recordings, found, loaded)
-    return found.problems, found.warnings
+    findings = Findings(warnings=list(_unknown_keys(f"{recordings.source}: manifest", recordings.manifest)))
+    _check_cameras(recordings, findings)
+    _check_captures(recordings, findings)
+    _check_spectra_and_targets(recordings, findings)
+    _check_frames(recordings, findings, loaded)
+    return findings.problems, findings.warnings

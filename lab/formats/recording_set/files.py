@@ -26,14 +26,26 @@ RAWS = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", 
 
 
 def locate(root: Path, path: str) -> Path:
-    """Return the file at a manifest's `path`. Raises InputError for a path that is absolute, missing, or outside
-    `root`."""
+    """Return the file of a recording set at a path in its folder.
+
+    root : the folder
+    path : as the manifest states it, with forward slashes
+
+    Raises InputError for a path that is absolute or leads out of the folder, isn't there, or can't be read.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     (Path(folder) / "frames").mkdir()
+    ...     (Path(folder) / "frames" / "dark-1.npy").touch()
+    ...     locate(Path(folder), "frames/dark-1.npy").name
+    'dark-1.npy'
+    """
     pure = PurePosixPath(path)
     if not path or "\\" in path or pure.is_absolute() or (len(path) > 1 and path[1] == ":"):
         raise InputError("not a path relative to the folder with '/'; move the file into the folder and name it so")
-    found = root / pure
+    file = root / pure
     try:
-        inside, exists, is_file = found.resolve().is_relative_to(root.resolve()), found.exists(), found.is_file()
+        inside, exists, is_file = file.resolve().is_relative_to(root.resolve()), file.exists(), file.is_file()
     except (OSError, ValueError, RuntimeError) as error:  # a loop of links, a NUL, a name too long
         raise InputError(f"no usable path ({one_line(error)}); rename the file") from error
     if not inside:
@@ -44,27 +56,27 @@ def locate(root: Path, path: str) -> Path:
         raise InputError(f"no such file{near}; add it, or take what needs it out of the manifest")
     if not is_file:
         raise InputError("not a file; name the file itself")
-    if not os.access(found, os.R_OK):
+    if not os.access(file, os.R_OK):
         raise InputError(
             "can't be read (Permission denied); run it as the user to whom it belongs, or have its permissions changed"
         )
-    return found
+    return file
 
 
 def _in_other_case(root: Path, path: PurePosixPath) -> list[str]:
     """Return the paths below `root` that differ from `path` by capitals alone."""
-    found = [root]
+    reached = [root]
     for part in path.parts:
         if part == "..":
             return []
-        found = [
+        reached = [
             entry
-            for folder in found
+            for folder in reached
             if folder.is_dir()
             for entry in folder.iterdir()
             if entry.name.casefold() == part.casefold()
         ]
-    return [entry.relative_to(root).as_posix() for entry in found]
+    return [entry.relative_to(root).as_posix() for entry in reached]
 
 
 def locate_as_written(root: Path, path: str) -> tuple[Path, str | None]:
@@ -129,8 +141,20 @@ def _load_raw(file: Path, shape: tuple[int, int] | None = None) -> NDArray[Any]:
 
 
 def load_frame(file: Path, shape: tuple[int, int] | None = None) -> Frame:
-    """One frame from an .npy, .tif/.tiff or camera-raw file: uint16 (rows, cols) as stored. Its InputError leaves the
-    path to the caller."""
+    """Return a frame as stored: uint16 (rows, cols).
+
+    file : .npy, .tif, .tiff or a camera raw
+    shape : rows and columns that it has, where they are known
+
+    Raises InputError, without the path, for what isn't a frame.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "dark-1.npy"
+    ...     np.save(file, np.full((4, 6), 64, np.uint16))
+    ...     load_frame(file, (4, 6)).shape
+    (4, 6)
+    """
     suffix = file.suffix.lower()
     if suffix == ".npy":
         return _load_npy(file, np.uint16)
@@ -180,7 +204,7 @@ class FolderFiles:
         return locate(self.root, path)
 
     def frame(self, path: str, camera: DataSheet) -> Frame:
-        return load_frame(locate(self.root, path), (camera.rows, camera.cols))
+        return load_frame(locate(self.root, path), camera.frame_shape)
 
     def spectrum(self, path: str) -> Spectrum:
         try:

@@ -116,7 +116,7 @@ def contents(recordings: RecordingSet) -> Iterator[tuple[str, bytes]]:
     for capture in recordings.manifest.captures:
         if capture.frame not in written:
             written.add(capture.frame)
-            yield capture.frame, _frame_content(recordings, capture.frame, recordings.frame(capture))
+            yield capture.frame, _frame_content(recordings, capture.frame, recordings.whole_frame(capture))
     yield from _rest(recordings)
     yield MANIFEST, manifest_json(recordings.manifest).encode()
 
@@ -126,14 +126,14 @@ def write(
     path: str | os.PathLike[str],
     *,
     progress: Callable[[str, float], None] | None = None,
-    told: Callable[[list[str]], None] | None = None,
+    report_warnings: Callable[[list[str]], None] | None = None,
 ) -> Path:
     """Write a recording set as the folder `path`: completely, or not at all. Frames stay bit-exact; each is read once.
 
     recordings : the set
     path : a new or an empty folder
     progress : called after each frame with its capture's id and the share of them
-    told : called with the warnings of the checks, which `read` gives again
+    report_warnings : called with the warnings of the checks, which `read` gives again
 
     Returns the folder. Raises InputError where `path` exists and isn't an empty folder, and RecordingError where the
     set itself would be refused by `read`.
@@ -170,8 +170,8 @@ def write(
         if folder.exists():
             folder.rmdir()
         partial.rename(folder)
-        if told is not None:
-            told(warnings)
+        if report_warnings is not None:
+            report_warnings(warnings)
     except BaseException as error:
         if made is not None:
             shutil.rmtree(made, ignore_errors=True)

@@ -9,15 +9,16 @@ import json
 import math
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self, get_args
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from lab.capture_kinds.base import CAPTURES, AnyCapture, Capture, Open
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import InputError, one_line
 from lab.plain_text import complaints_of, escaped
 from sim.camera import Cfa, Shutter, Side
+from sim.sensor.margins import NO_MARGINS, Margins
 
 #
 # The instruments say it themselves, before the first capture. Two snapshots are compared by `differences`.
@@ -82,7 +83,7 @@ def _changed(name: str, before: InstrumentSnapshot, now: InstrumentSnapshot) -> 
             continue
         was, is_now = before.settings.get(key), now.settings.get(key)
         if not _same(was, is_now):
-            yield f"{name}: {key} was {told(was)}, is {told(is_now)}"
+            yield f"{name}: {key} was {format_setting(was)}, is {format_setting(is_now)}"
 
 
 def _same(was: Value | None, is_now: Value | None) -> bool:
@@ -91,7 +92,7 @@ def _same(was: Value | None, is_now: Value | None) -> bool:
     return was == is_now
 
 
-def told(value: Value | None) -> str:
+def format_setting(value: Value | None) -> str:
     """Return a setting's value in words."""
     return "not there" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
@@ -101,10 +102,15 @@ MOST_PX = 1 << 15
 
 
 class DataSheet(Open):
-    """The manufacturer's data of one camera, which the fits test. None: not known."""
+    """The manufacturer's data of one camera, which the fits test. None: not known.
+
+    `rows`, `cols`: of the active area, which sees light. `margins`: masked pixels and overscan around it, which the
+    frames hold, too.
+    """
 
     rows: int = Field(gt=0, le=MOST_PX)
     cols: int = Field(gt=0, le=MOST_PX)
+    margins: Margins = NO_MARGINS
     pixel_pitch_um: float | None = Field(default=None, gt=0)
     fill_factor: float | None = Field(default=None, gt=0, le=1)
     cfa: Cfa
@@ -129,10 +135,25 @@ class DataSheet(Open):
     def _known_channels(cls, value: Any) -> Any:
         return {key: path for key, path in value.items() if path is not None} if isinstance(value, dict) else value
 
+    @model_validator(mode="after")
+    def _keeps_the_mosaic(self) -> Self:
+        before = self.margins.lines[0][0], self.margins.lines[1][0]
+        if self.cfa != "MONO" and any(number % 2 for number in before):
+            raise ValueError(
+                f"margins: {before[0]} rows and {before[1]} columns before the active area shift the colour filters; "
+                "give an even number of each"
+            )
+        return self
+
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of the colour channels, in the order R, G, B; `("Y",)` for a MONO sensor."""
         return ("Y",) if self.cfa == "MONO" else ("R", "G", "B")
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame, margins included."""
+        return self.margins.frame_shape(self.rows, self.cols)
 
     @property
     def saturation_dn(self) -> float:
@@ -187,34 +208,36 @@ def _schema_lines(where: str, error: ValidationError) -> Iterator[str]:
             yield f"{where}: {key or 'it'}: {item['msg'][:1].lower()}{item['msg'][1:]}{given}; correct it"
 
 
-def _usable_captures(listed: list[Any], where: str, sides: Container[str], found: Findings) -> list[Capture]:
+def _usable_captures(listed: list[Any], where: str, sides: Container[str], findings: Findings) -> list[Capture]:
     captures: list[Capture] = []
     for number, item in enumerate(listed):
         at = f"{where}: captures[{number}]"
         if not isinstance(item, dict):
-            found.problems.append(f"{at}: isn't an object; write the capture's keys")
+            findings.problems.append(f"{at}: isn't an object; write the capture's keys")
             continue
         at += f" ({escaped(str(item['id']))})" if item.get("id") is not None else ""
         if lines := list(complaints_of(item)):
-            found.problems += [f"{at}: {line}" for line in lines]
+            findings.problems += [f"{at}: {line}" for line in lines]
             continue
         kind = item.get("kind")
         if not isinstance(kind, str):
-            found.problems.append(f"{at}: the kind is {kind!r}; write one of {', '.join(CAPTURES.names)}")
+            findings.problems.append(f"{at}: the kind is {kind!r}; write one of {', '.join(CAPTURES.names)}")
             continue
         if kind not in CAPTURES.models:
-            found.warnings.append(f"{at}: unknown kind '{kind}' is skipped; the kinds are {', '.join(CAPTURES.names)}")
+            findings.warnings.append(
+                f"{at}: unknown kind '{kind}' is skipped; the kinds are {', '.join(CAPTURES.names)}"
+            )
             continue
         if why := CAPTURES.models[kind].unsupported(item):
-            found.warnings.append(f"{at}: {why}")
+            findings.warnings.append(f"{at}: {why}")
             continue
         try:
             capture = CAPTURES.parse(item)
         except ValidationError as error:
-            found.problems += _schema_lines(at, error)
+            findings.problems += _schema_lines(at, error)
             continue
         if capture.side not in sides:
-            found.problems.append(f"{at}: no camera '{capture.side}' in cameras; describe it, or correct the side")
+            findings.problems.append(f"{at}: no camera '{capture.side}' in cameras; describe it, or correct the side")
             continue
         captures.append(capture)
     return captures
@@ -239,27 +262,27 @@ def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
     if raw.get("format") != "calibench-recording" or raw.get("version") != 1:
         given = f"format {raw.get('format')!r} version {raw.get('version')!r}"
         raise RecordingError([f"{where}: {given}, not 'calibench-recording' 1; give a recording set of that version"])
-    found = Findings()
-    found.problems += [f"{where}: {line}" for line in text_problems(raw, "captures")]
+    findings = Findings()
+    findings.problems += [f"{where}: {line}" for line in text_problems(raw, "captures")]
     listed, cameras = raw.get("captures"), raw.get("cameras")
     captures: list[Capture] = []
     if isinstance(listed, list):
         # Errors in the cameras themselves are reported below, once.
         sides = cameras if isinstance(cameras, dict) and cameras else get_args(Side)
-        captures = _usable_captures(listed, where, sides, found)
+        captures = _usable_captures(listed, where, sides, findings)
         raw["captures"] = ()
-        if not captures and not found.problems:
-            found.problems += [*found.warnings, f"{where}: no capture that can be used; list what was captured"]
+        if not captures and not findings.problems:
+            findings.problems += [*findings.warnings, f"{where}: no capture that can be used; list what was captured"]
     manifest: Manifest | None = None
     try:
         manifest = Manifest.model_validate(raw)
     except ValidationError as error:
-        found.problems += _schema_lines(where, error)
+        findings.problems += _schema_lines(where, error)
     if manifest is not None and not manifest.cameras:
-        found.problems.append(f"{where}: cameras is empty; describe the left camera at least")
-    if found.problems or manifest is None:
-        raise RecordingError(found.problems)
-    return without_common_photons(manifest.model_copy(update={"captures": tuple(captures)}), where, found.warnings)
+        findings.problems.append(f"{where}: cameras is empty; describe the left camera at least")
+    if findings.problems or manifest is None:
+        raise RecordingError(findings.problems)
+    return without_common_photons(manifest.model_copy(update={"captures": tuple(captures)}), where, findings.warnings)
 
 
 #: Exposures from which on one number of photons for all flats is taken for that of a setting, not of an exposure: a

@@ -19,6 +19,7 @@ from lab.formats.recording_set.frame_codes import FrameCodes
 from lab.formats.recording_set.manifest import DataSheet, Manifest
 from lab.shown import Tabular
 from sim.camera import Side
+from sim.sensor.margins import NO_MARGINS
 from sim.spectrum import Spectrum
 
 C = TypeVar("C", bound=Capture)
@@ -35,11 +36,11 @@ class Summaries:
     @property
     def made(self) -> Summaries:
         """A copy without those that couldn't be made."""
-        one, two = (
-            {key: found for key, found in kept.items() if not isinstance(found, NotDetermined)}
+        of_frames, of_manifest = (
+            {key: summary for key, summary in kept.items() if not isinstance(summary, NotDetermined)}
             for kept in (self.of_frames, self.of_manifest)
         )
-        return Summaries(one, two)
+        return Summaries(of_frames, of_manifest)
 
 
 class RecordingSet(Tabular):
@@ -149,8 +150,8 @@ class RecordingSet(Tabular):
             cache_bytes=self.cache_bytes if cache_bytes is None else cache_bytes,
         )
         if files is None:
-            own = self._summaries.of_manifest if manifest is None else {}
-            copy._summaries = Summaries(self._summaries.of_frames, own)
+            summaries_of_manifest = self._summaries.of_manifest if manifest is None else {}
+            copy._summaries = Summaries(self._summaries.of_frames, summaries_of_manifest)
         return copy
 
     def capture(self, id: str) -> Capture:
@@ -161,8 +162,18 @@ class RecordingSet(Tabular):
         raise InputError(f"{self.source}: no capture '{id}'; the manifest lists {len(self.manifest.captures)} others")
 
     def frame(self, capture: Capture) -> Frame:
-        """Raw DN of a capture: uint16 (rows, cols), read-only. Raises InputError where the file contradicts the
-        manifest."""
+        """Raw DN of a capture: uint16 (rows, cols) of the active area, read-only. Raises InputError where the file
+        contradicts the manifest."""
+        whole, camera = self.whole_frame(capture), self.camera(capture.side)
+        if whole.shape == (camera.rows, camera.cols):
+            return whole
+        frame = np.ascontiguousarray(camera.margins.active(whole))
+        frame.flags.writeable = False
+        return frame
+
+    def whole_frame(self, capture: Capture) -> Frame:
+        """Return the raw DN of a capture with its margins: uint16 (rows, cols), read-only; a frame that was stored
+        without them is its active area. Raises InputError where the file contradicts the manifest."""
         with self._lock:
             if capture.frame in self._cache:
                 self._cache.move_to_end(capture.frame)
@@ -207,10 +218,10 @@ class RecordingSet(Tabular):
                 made = refused
             with self._lock:
                 kept.setdefault(key, made)
-        found = kept[key]
-        if isinstance(found, NotDetermined):
-            raise NotDetermined(found.step, found.reason)
-        return cast(T, found)
+        summary = kept[key]
+        if isinstance(summary, NotDetermined):
+            raise NotDetermined(summary.step, summary.reason)
+        return cast(T, summary)
 
     @property
     def summaries(self) -> Summaries:
@@ -255,10 +266,12 @@ class RecordingSet(Tabular):
 
 def frame_problem(frame: Frame, camera: DataSheet) -> str | None:
     """Why `frame` can't be a frame of `camera`, with the remedy; None where it can."""
-    if frame.shape != (camera.rows, camera.cols):
+    if frame.shape not in (camera.frame_shape, (camera.rows, camera.cols)):
+        rows, cols = camera.frame_shape
+        margins = "" if camera.margins == NO_MARGINS else " with the margins"
         return (
             f"{frame.shape[0]} x {frame.shape[1]} pixels (rows x cols), but the manifest says "
-            f"{camera.rows} x {camera.cols}; recapture, or correct rows and cols"
+            f"{rows} x {cols}{margins}; recapture, or correct rows and cols{margins and ', or margins'}"
         )
     highest, limit = int(frame.max()), 2**camera.bit_depth - 1
     if highest > limit:

@@ -138,10 +138,12 @@ class _Counts:
     captures: list[str]
     planes: list[PlaneCounts]
 
-    def add(self, frame: Any, capture: str) -> None:
-        """Add a frame's codes."""
-        self.count[:] += np.bincount(frame.ravel(), minlength=len(self.count))[: len(self.count)]
-        self.captures.append(capture)
+    def add(self, dataset: Dataset, capture: Any) -> None:
+        """Add the codes of a capture's frame."""
+        codes = dataset.recordings.codes(capture).every
+        inside = codes.code_dn < len(self.count)
+        self.count[codes.code_dn[inside]] += codes.number[inside]
+        self.captures.append(capture.id)
 
 
 def counted(dataset: Dataset) -> dict[bool, _Counts]:
@@ -168,7 +170,7 @@ def counted(dataset: Dataset) -> dict[bool, _Counts]:
         lights: dict[tuple[bool, _Plane], EvenLight] = {}
         for capture in setting:
             is_out = capture.id in out
-            counts[is_out].add(dataset.recordings.frame(capture), capture.id)
+            counts[is_out].add(dataset, capture)
             for key, plane in _planes(dataset, capture):
                 own = sensitivity[key] if _clipped_share(dataset, plane) < 0.5 else 0.0
                 lights.setdefault((is_out, key), EvenLight(dataset.noise.black)).add(plane, own)
@@ -217,7 +219,7 @@ def counted_in_all(dataset: Dataset) -> dict[bool, _Counts]:
         if capture.kind in {"dark", "flat", "narrowband"} or getattr(capture, "gain_db", None):
             continue
         number[capture.kind] = number.get(capture.kind, -1) + 1
-        found[number[capture.kind] % 3 == 1].add(dataset.recordings.frame(capture), capture.id)
+        found[number[capture.kind] % 3 == 1].add(dataset, capture)
     return found
 
 

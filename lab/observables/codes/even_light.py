@@ -8,12 +8,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numba import njit
 from scipy import ndimage, sparse
 from scipy.special import ndtr
 
 from lab.observables.codes.landings import MARGIN
 from lab.observables.noise.surface import shading
 from sim.spectrum import FloatArray
+
+# mypy: disallow-untyped-decorators=False
 
 AROUND = 9  # side of the box in a plane of the mosaic whose mean is the light at a pixel, px
 #: Width of the levels whose pixels share one distribution, over the standard deviation of the noise.
@@ -133,17 +136,30 @@ class EvenLight:
 
 def _cells(surface: FloatArray, local: FloatArray, step_dn: float) -> FloatArray:
     """Return the cells of `EvenLight` (5, cells): pixels by their level and by the group of their local mean."""
-    level = np.maximum(surface.ravel() / step_dn, 0.0)
-    index = level.astype(np.int64)
-    group = np.maximum(local.ravel() / (LEVELS_TOGETHER * step_dn), 0.0).astype(np.int64)
-    first, begin = int(index.min()), int(group.min())
-    width = int(index.max()) - first + 1
-    both = (group - begin) * width + index - first
-    above = (level - index) * step_dn
-    number = np.bincount(both)
-    at = np.flatnonzero(number)
-    sums = (np.bincount(both, weights)[at] for weights in (above, np.square(above)))
-    return np.array((at // width + begin, at % width + first, number[at], *sums), float)
+    first, last = (max(int(end / step_dn), 0) for end in (surface.min(), surface.max()))
+    begin, end = (max(int(end / (LEVELS_TOGETHER * step_dn)), 0) for end in (local.min(), local.max()))
+    sums = np.zeros((end - begin + 1, last - first + 1, 3))
+    _add_cells(surface, local, step_dn, LEVELS_TOGETHER * step_dn, first, begin, sums)
+    group, level = np.nonzero(sums[..., 0])
+    return np.array((group + begin, level + first, *sums[group, level].T))
+
+
+@njit(cache=True)
+def _add_cells(
+    surface: FloatArray, local: FloatArray, step_dn: float, wide_dn: float, first: int, begin: int, sums: FloatArray
+) -> None:
+    """Add to `sums` (groups, levels, 3) the number of pixels, the sum of their levels above the step's lower border,
+    DN, and that of its squares: of groups from `begin` and levels from `first` on."""
+    for i in range(surface.shape[0]):
+        for j in range(surface.shape[1]):
+            value = max(surface[i, j] / step_dn, 0.0)
+            level, group = int(value), int(max(local[i, j] / wide_dn, 0.0))
+            above = (value - level) * step_dn
+            # rounding may put the lowest and the highest pixel beside the table
+            cell = sums[min(max(group - begin, 0), len(sums) - 1), min(max(level - first, 0), sums.shape[1] - 1)]
+            cell[0] += 1.0
+            cell[1] += above
+            cell[2] += above * above
 
 
 def _limited_square(departures: FloatArray) -> float:

@@ -11,7 +11,7 @@ from lab.errors import NotDetermined
 from lab.observables.darks.defective_pixels import COUNT_STD, rooted_counts
 from lab.observables.darks.frames import DarkStatistics, captures_of, dark_frames
 from lab.observables.dataset import Dataset
-from lab.observables.noise.robust import lower_median, sampled
+from lab.observables.noise.robust import sampled
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray
@@ -60,24 +60,35 @@ def count_events(dataset: Dataset) -> list[_Events]:
         for frame in frames[2:]:
             second = np.maximum(second, np.minimum(highest, frame))
             highest = np.maximum(highest, frame)
-        usual = lower_median(frames) if len(frames) in {3, 5} else np.median(frames, axis=0)
-        std = np.sqrt(moving + dataset.noise.gain * np.maximum(usual, 0.0))
-        least = np.maximum(BRIGHT * std, LEAST_STEPS * dataset.step_dn)
-        hit = highest - second > least
-        edges = float(np.median(least)) * np.array(EVENT_EDGES)
+        # few pixels exceed what the least noise asks for: the median of the others isn't needed
+        lowest = max(BRIGHT * float(np.sqrt(moving)), LEAST_STEPS * dataset.step_dn)
+        row, col = np.nonzero(highest - second > lowest)
+        usual = np.asarray(np.median(frames[:, row, col], axis=0), float)
+        hit = highest[row, col] - second[row, col] > _least_dn(dataset, moving, usual)
+        row, col, usual = row[hit], col[hit], usual[hit]
+        typical = np.median(np.array([sampled(frame) for frame in frames]), axis=0)
+        edges = float(np.median(_least_dn(dataset, moving, typical))) * np.array(EVENT_EDGES)
         counts = {True: np.zeros(len(edges)), False: np.zeros(len(edges))}
         seen = len(dark.condition.seen)
         for k, frame in enumerate(frames):
-            own = hit & (frame == highest)
-            label, number = ndimage.label(own, TOUCHING)
-            if number:
-                bright = ndimage.maximum(frame - usual, label, np.arange(1, number + 1))
-                counts[k >= seen] += np.histogram(bright, [*edges, np.inf])[0]
+            own = frame[row, col] == highest[row, col]
+            if own.any():
+                bright = np.zeros(frame.shape, np.float32)
+                bright[row[own], col[own]] = (frame[row, col] - usual)[own]
+                label, number = ndimage.label(bright, TOUCHING)
+                brightest = ndimage.maximum(bright, label, np.arange(1, number + 1))
+                counts[k >= seen] += np.histogram(brightest, [*edges, np.inf])[0]
         numbers = {False: min(seen, len(captures)), True: max(len(captures) - seen, 0)}
         found += [
             _Events(dark, out, number, len(captures), edges, counts[out]) for out, number in numbers.items() if number
         ]
     return found
+
+
+def _least_dn(dataset: Dataset, variance_dn2: float, usual_dn: FloatArray) -> FloatArray:
+    """Return the least brightness of an event at pixels (n,) of a usual value, with the shot noise of that value."""
+    std = np.sqrt(variance_dn2 + dataset.noise.gain * np.maximum(usual_dn, 0.0))
+    return np.maximum(BRIGHT * std, LEAST_STEPS * dataset.step_dn)
 
 
 def measure_dark_events(dataset: Dataset) -> Observable:

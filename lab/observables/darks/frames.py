@@ -26,6 +26,7 @@ from lab.observables.noise.robust import (
     from_surroundings,
     local_variance,
     robust_std,
+    sampled,
     without_lines,
 )
 from lab.observables.noise.side_levels import usual_darks
@@ -294,10 +295,10 @@ def _pattern(mean: Image, part: list[Image], captures: tuple[str, ...], step_dn:
     """Return the fixed pattern of the mean of the frames of `captures`, and of the median of `part`, the first of
     them."""
     away, local = from_surroundings(part, step_dn)
-    z = away / local
+    z = np.divide(away, local, out=away)
     edges = np.array([-np.inf, -TAIL_EDGES[1], -TAIL_EDGES[0], *TAIL_EDGES, np.inf])
-    counts = np.histogram(z, edges)[0].astype(float)
-    low, high = np.quantile(z, [0.005, 0.995])
+    counts = np.histogram(z[np.abs(z) >= TAIL_EDGES[0]], edges)[0].astype(float)
+    low, high = np.quantile(sampled(z), [0.005, 0.995])
     # spectra and cells are of the mean frame, with defective pixels clipped
     std = robust_std(mean, step_dn)
     smooth = ndimage.uniform_filter(np.clip(mean, -8.0 * std, 8.0 * std), SMOOTH_PX, mode="mirror")
@@ -318,7 +319,7 @@ def _pattern(mean: Image, part: list[Image], captures: tuple[str, ...], step_dn:
         },
         line_dn2={lines: max(value, 0.0) for lines, value in excess.items()},
         counts=np.concatenate([counts[3:], counts[1::-1]]),
-        spread_dn=float(np.median(local)),
+        spread_dn=float(np.median(sampled(local))),
         skewness=float(np.clip(3.0 * (low + high) / 5.63, 0.0, 1.0)),
     )
 

@@ -13,7 +13,7 @@ import numpy as np
 from lab.errors import NotDetermined
 from lab.observables.darks.frames import DarkStatistics, captures_of, dark_frames
 from lab.observables.dataset import Dataset
-from lab.observables.noise.robust import MEDIAN_OF, Image, from_surroundings
+from lab.observables.noise.robust import MEDIAN_OF, Image, from_surroundings, sampled
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
 from sim.point import trail_behind
@@ -128,7 +128,7 @@ def _of_part(dataset: Dataset, dark: DarkStatistics, held_out: bool) -> tuple[li
     away, local = from_surroundings([f - np.float32(f.mean(dtype=np.float64)) for f in raw], dataset.step_dn)
     below = np.float32(0.9 * dataset.saturation_dn) - np.max(raw, axis=0)
     moving = next((part.pixel_dn2 for part in dark.changing.values()), 0.0)
-    variance: FloatArray = np.square(np.median(local))
+    variance: FloatArray = np.square(np.median(sampled(local)))
     factor = 1.0 if len(raw) == 1 else MEDIAN_VARIANCE / len(raw)
     return _trails(away, local, below), float(np.clip(1.0 - factor * moving / variance, 0.0, 1.0))
 

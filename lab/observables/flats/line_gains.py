@@ -15,7 +15,7 @@ from lab.errors import NotDetermined
 from lab.observables.darks.readout import OFFSETS_STD, DarkReadOut, dark_readout
 from lab.observables.dataset import Dataset
 from lab.observables.flats.images import LEAST_SIGNAL, brightest_signal, dark_level_dn, even_lines, flats
-from lab.observables.noise.line_spectra import log_mean_bias
+from lab.observables.noise.line_spectra import BAND_PIXELS, log_mean_bias, middle
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import COLLECTED, GAINS, LINE_GAINS, TRAILS, acting
 from sim.effects.base import Effects
@@ -160,6 +160,12 @@ def _along(count: int) -> range:
     return range(2, min(max(int(HIGHEST_ALONG * count), 1 + FEWEST_ALONG), count // 2 - 1) + 1)
 
 
+def _pixels_of_noise(pixels: int, count: int) -> slice:
+    """Return the pixels of `count` lines of `pixels` whose noise stands for that of all: of a large image, the middle
+    ones of each line."""
+    return middle(pixels, BAND_PIXELS // count) if pixels * count > 2 * BAND_PIXELS else slice(0, pixels)
+
+
 def _window(count: int) -> FloatArray:
     """Hann window of mean square 1."""
     w = 1.0 - np.cos(2.0 * np.pi * (np.arange(count) + 0.5) / count)
@@ -213,24 +219,23 @@ def _line_power(line: FloatArray, lines: Lines) -> FloatArray:
 
 
 def _powers(image: FloatArray, lines: Lines) -> tuple[FloatArray, FloatArray]:
-    """Power of lines, times their pixels, and of pixels, by band; of an image (pixels, lines)."""
+    """Power of lines, times their pixels, and of pixels (`_pixels_of_noise`), by band; of an image (pixels, lines) less
+    a polynomial surface of light."""
     pixels, count = image.shape
-    image = _without_light(image)
+    down, across = (np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), LIGHT_DEGREE) for n in image.shape)
+    down, across = (np.linalg.qr(base)[0] for base in (down, across))
+    light = down.T @ image @ across @ across.T
     window = _window(count)
-    table = np.square(np.abs(np.fft.fft(np.fft.rfft(image * window, axis=1), axis=0))) / image.size
-    along = np.array(_along(pixels))
-    white = np.concatenate([table[along], table[-along]])
-    line = np.square(np.abs(np.fft.rfft(_without_repeats(image.mean(axis=0), lines) * window))) * pixels / count
+    part = _pixels_of_noise(pixels, count)
+    rest = np.asarray((image[part] - down[part] @ light) * window, np.float32)
+    spectrum = np.fft.fft(np.fft.rfft(rest, axis=1), axis=0)
+    along = np.array(_along(len(rest)))
+    white = np.square(np.abs(np.concatenate([spectrum[along], spectrum[-along]])), dtype=float) / rest.size
+    mean = image.mean(axis=0) - down.mean(axis=0) @ light
+    line = np.square(np.abs(np.fft.rfft(_without_repeats(mean, lines) * window))) * pixels / count
     bands = _bands(count)
     of_lines, of_pixels = (np.array([power[..., band].mean() for band in bands]) for power in (line, white))
     return of_lines / _share_and_modes(lines, count)[0], of_pixels
-
-
-def _without_light(image: FloatArray) -> FloatArray:
-    """Take a polynomial surface out of an image, (rows, cols)."""
-    down, across = (np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), LIGHT_DEGREE) for n in image.shape)
-    down, across = (np.linalg.qr(base)[0] for base in (down, across))
-    return np.asarray(image - down @ (down.T @ image @ across) @ across.T)
 
 
 def _halves(dataset: Dataset, dark: DarkReadOut, held_out: bool) -> tuple[FloatArray, FloatArray, float] | None:
@@ -276,7 +281,8 @@ def _read(
     of_dark, dark_white = _powers(np.asarray(offsets, np.float64), lines)
     pixels, count = first.shape
     modes = _share_and_modes(lines, count)[1]
-    pixel_modes = _share_and_modes("columns", count)[1] * 2.0 * len(_along(pixels))
+    part = _pixels_of_noise(pixels, count)
+    pixel_modes = _share_and_modes("columns", count)[1] * 2.0 * len(_along(part.stop - part.start))
     shared = np.where(line_noise - noise > SEEN * noise / np.sqrt(modes), line_noise - noise, 0.0)
     return _Lines(
         lines=lines,

@@ -54,7 +54,7 @@ def measure_noise_neighbours(dataset: Dataset) -> Observable:
         parts = []
         for r in points:
             gain, gain_db = noise.gain * r.gain, dataset.usual_gain_db + 20.0 * np.log10(r.gain)
-            electrons = np.array([max(s, 0.0) / gain for s in r.signal.values()])
+            electrons = np.array([max(s, 0.0) / gain for s in r.ordinary.values()])
             read = max(noise.read_dn**2 - noise.quantisation_dn2, 0.1 * noise.read_dn**2) / noise.gain**2
             slow = sum(one.own_e2 for one in ordered)  # a part of what is measured as read noise
             parts.append(

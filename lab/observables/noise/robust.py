@@ -32,16 +32,19 @@ def from_surroundings(frames: list[Image], step_dn: float = 1.0) -> tuple[Image,
 
     std = robust_std(median, step_dn)
     flat, _ = without_lines(median, np.clip(median, -CLIP * std, CLIP * std))
-    step = 2
-    for r in range(step):
-        for c in range(step):
-            phase = flat[r::step, c::step]
-            phase -= np.float32(np.mean(np.clip(phase, -CLIP * std, CLIP * std)))
-    around = ndimage.uniform_filter(np.clip(flat, -CLIP * std, CLIP * std), SMOOTH_PX, mode="mirror")
-    steep = np.clip(flat - around, -CLIP * std, CLIP * std)
+    del median
+    cut = np.clip(flat, -CLIP * std, CLIP * std)
+    for r in range(2):  # the mosaic's four phases
+        phases = [cut[r::2, c::2].mean(dtype=float) for c in range(2)]
+        flat[r::2] -= np.resize(phases, flat.shape[1]).astype(np.float32)
+    np.clip(flat, -CLIP * std, CLIP * std, out=cut)
+    around = ndimage.uniform_filter(cut, SMOOTH_PX, mode="mirror")
+    np.subtract(flat, around, out=cut)
     # a second pass, so that hot pixels in a glow don't shift the mean around them
-    around += ndimage.uniform_filter(steep, SMOOTH_PX, mode="mirror")
-    away = flat - around
+    around += ndimage.uniform_filter(np.clip(cut, -CLIP * std, CLIP * std, out=cut), SMOOTH_PX, mode="mirror")
+    del cut
+    away = np.subtract(flat, around, out=flat)
+    del around
     local = np.sqrt(np.maximum(local_variance(np.square(away), 1), 0.25 * step_dn**2)) * np.sqrt(
         SMOOTH_PX**2 / (SMOOTH_PX**2 - 1.0)
     )

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lab.observables.codes.rounding import QUANTISATION_DN2
 from lab.observables.noise.frame_sums import BoolArray
+from lab.observables.noise.robust import sampled
 from sim.camera import Cfa
 from sim.sensor.mosaic import planes
 
@@ -60,12 +61,12 @@ def defective_pixels(image: NDArray[np.floating[Any]], cfa: Cfa, step_dn: float 
     """
     bad = np.zeros(image.shape, bool)
     for name, plane in planes(image, cfa).items():
-        rest = plane - np.median(plane)
+        rest = plane - np.median(sampled(plane))
         # Most pixels of a rounded plane may be equal: the least scale is then that of rounding, else a tenth of a step
-        least = step_dn * (np.sqrt(QUANTISATION_DN2) if not np.median(np.abs(rest)) > 0 else 0.1)
+        least = step_dn * (np.sqrt(QUANTISATION_DN2) if not np.median(np.abs(sampled(rest))) > 0 else 0.1)
         for _ in range(2):  # glow widens the first scale, hot pixels distort the first surface
-            limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), least)
+            limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(sampled(rest)))), least)
             rest = rest - shading(np.clip(rest, -limit, limit))
-        limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), least)
+        limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(sampled(rest)))), least)
         planes(bad, cfa)[name][...] = np.abs(rest) > limit
     return bad

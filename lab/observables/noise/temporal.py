@@ -4,8 +4,9 @@ pixels.
 Noise is the departure of a frame from the mean of its repeats. Before, the frame's level is removed in each plane of
 the mosaic (as a factor for flats, so that shading and PRNU cancel where the lamp varies), and afterwards the mean of
 every row and column (row and column noise, flicker). The variance that this takes from the pixels is restored. Pixels
-beyond `OUTLIER` standard deviations are left out of the correlation, and so are frequencies: clocks of the read-out
-leave tones in a frame, of another phase in the next.
+beyond `OUTLIER` standard deviations are left out of the correlation, of its variance and of the signal that it belongs
+to: hot pixels hold much of a dark frame's noise, and none of its correlation. So are frequencies: clocks of the
+read-out leave tones in a frame, of another phase in the next.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
 OUTLIER = 6.0
+#: Passes in which the standard deviation of pixels that aren't outlying settles.
+PASSES = 4
 #: Pixel values from which a level is measured; further frames wouldn't improve it noticeably.
 ENOUGH = 3_000_000
 LEAST_PLANE_PX = 4  # least side of a plane of the mosaic
@@ -49,6 +52,7 @@ class Repeats:
     gain: float  # factor on the dataset's conversion gain, that of its usual setting, by the setting in dB
     held_out: bool
     signal: dict[str, float]  # mean above black, DN
+    ordinary: dict[str, float]  # the same of pixels whose mean isn't outlying, to which the correlation belongs
     variance: dict[str, float | None]  # DN^2; None where the plane clips, or rounding hides the noise
     relative_std: dict[str, float]  # relative standard deviation of the variance
     correlation: FloatArray  # by `PAIRS`, (6,); NaN where it isn't determined
@@ -93,11 +97,12 @@ def repeats_of(dataset: Dataset, captures: Sequence[Any], held_out: bool) -> Rep
         )
     use = list(captures)[: max(2, int(np.ceil(ENOUGH / first.size)) + 1)]
     frames = [np.array(dataset.recordings.frame(c), np.float32) for c in use]
-    signal, clipped = {}, {}
+    signal, ordinary, clipped = {}, {}, {}
     for name in mosaic.planes(first, cfa):
         planes = [mosaic.planes(f, cfa)[name] for f in frames]
         clipped[name] = max(float(np.mean((p >= dataset.saturation_dn) | (p <= 0))) for p in planes)
         signal[name] = float(np.mean([p.mean(dtype=float) for p in planes])) - dataset.noise.black
+        ordinary[name] = _ordinary_mean(np.mean(planes, axis=0, dtype=np.float64)) - dataset.noise.black
     level = float(np.mean(list(signal.values())))
     dark_dn = abs(dataset.noise.dark_dn_per_s) * captures[0].exposure_s
     freedom = len(frames) - 1
@@ -111,7 +116,7 @@ def repeats_of(dataset: Dataset, captures: Sequence[Any], held_out: bool) -> Rep
         variance[name] = alike * sum(float(np.mean(np.square(p), dtype=float)) for p in planes) / freedom / taken
         for plane in planes:
             np.divide(plane, np.float32(np.sqrt(max(variance[name], 1e-12))), out=plane)
-            plane[np.abs(plane) > OUTLIER] = 0.0
+        _leave_out(planes, alike, freedom, taken)
     tones = [_take_out_tones(frame) for frame in frames]
     correlation = _correlations(frames, alike, freedom, cfa)
     covariance = independent_correlations(first.shape, freedom, cfa)[1]
@@ -128,6 +133,7 @@ def repeats_of(dataset: Dataset, captures: Sequence[Any], held_out: bool) -> Rep
         gain=10.0 ** (((captures[0].gain_db or 0.0) - dataset.usual_gain_db) / 20.0),
         held_out=held_out,
         signal=signal,
+        ordinary=ordinary,
         variance={n: v if clean[n] and moving else None for n, v in variance.items()},
         relative_std={
             n: float(np.sqrt(2.0 * spread / (freedom * (rows - 1) * (cols - 1)))) for n, (rows, cols) in sizes.items()
@@ -137,6 +143,33 @@ def repeats_of(dataset: Dataset, captures: Sequence[Any], held_out: bool) -> Rep
         tones=float(np.mean(tones)),
         one_tone=OUTLIER**2 / first.size / freedom,
     )
+
+
+def _ordinary_mean(means: FloatArray) -> float:
+    """Return the mean of values (rows, cols) without those beyond `OUTLIER` standard deviations."""
+    kept = means
+    for _ in range(PASSES):
+        beyond = np.abs(kept - np.median(kept)) > OUTLIER * kept.std()
+        if not beyond.any():
+            break
+        kept = kept[~beyond]
+    return float(kept.mean())
+
+
+def _leave_out(planes: Sequence[Any], alike: int, freedom: int, taken: float) -> None:
+    """Set departures (rows, cols) of one plane's frames, of variance 1, to 0 beyond `OUTLIER` standard deviations of
+    the others, and scale these to variance 1, in place. `taken`: share of the variance that means of lines leave."""
+    for _ in range(PASSES):
+        beyond = [np.abs(plane) > OUTLIER for plane in planes]
+        if not any(map(np.any, beyond)):
+            return
+        for plane, out in zip(planes, beyond, strict=True):
+            plane[out] = 0.0
+        inside = 1.0 - float(np.mean(beyond))
+        square = alike * sum(float(np.mean(np.square(p), dtype=float)) for p in planes) / freedom / taken
+        scale = np.float32(1.0 / np.sqrt(max(square / inside, 1e-12)))
+        for plane in planes:
+            np.multiply(plane, scale, out=plane)
 
 
 def level_out(frames: list[Any], cfa: Cfa, black_dn: float | None) -> tuple[list[Any], int]:

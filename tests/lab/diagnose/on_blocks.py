@@ -22,6 +22,7 @@ from sim.camera import CameraModel, Cfa, Lens
 from sim.effects.base import Effect
 from sim.frame import Exposure, sample
 from sim.scene.scenes import Darkness, UniformField
+from sim.sensor.margins import NO_MARGINS, Margins
 from sim.spectrum import Spectrum
 from sim.uniform import electron_rate
 
@@ -71,10 +72,16 @@ def sigmas(found: MeasurementModel, effects: Sequence[Effect] = ()) -> float:
 
 
 def rendered(
-    seed: int, effects: Sequence[Effect] = (), *, sweep_to_nm: int = 0, repeats: int = 3, cfa: Cfa = "MONO"
+    seed: int,
+    effects: Sequence[Effect] = (),
+    *,
+    sweep_to_nm: int = 0,
+    repeats: int = 3,
+    cfa: Cfa = "MONO",
+    margins: Margins = NO_MARGINS,
 ) -> RecordingSet:
     """A session that `sim` takes: darks, flats at eight levels, a sweep from 400 nm where `sweep_to_nm` says how
-    far."""
+    far. `margins`: of its frames."""
     wavelength = np.arange(380.0, max(781.0, sweep_to_nm + 41.0))
     curves = {"Y": (540.0, 140.0)} if cfa == "MONO" else {"R": (610.0, 40.0), "G": (540.0, 40.0), "B": (460.0, 35.0)}
     efficiency = {
@@ -97,7 +104,9 @@ def rendered(
         scene = Darkness() if light is None else UniformField(light, kind)
         for _ in range(count):
             k = len(captures)
-            frames[f"{k}.npy"] = sample(camera, Exposure(scene, exposure_s, elapsed_s=20.0137 * k), rng, effects)
+            frames[f"{k}.npy"] = sample(
+                camera, Exposure(scene, exposure_s, elapsed_s=20.0137 * k), rng, effects, margins=margins
+            )
             when = datetime(2026, 3, 2, tzinfo=UTC) + timedelta(seconds=20.0137 * k)
             captures.append(
                 {
@@ -129,6 +138,7 @@ def rendered(
         "black_level_dn": 128.0,
         "white_level_dn": 4095.0, "f_number": 4.0, "focal_length_mm": 8.0, "lens_transmittance": 1.0,
         "quantum_efficiency": {channel: f"qe-{channel}.csv" for channel in efficiency},
+        "margins": margins,
     }  # fmt: skip
     manifest = Manifest.model_validate({"name": "sim", "cameras": {"left": stated}, "captures": captures})
     return RecordingSet(manifest, frames, spectra, source="sim")

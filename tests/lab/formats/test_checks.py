@@ -102,7 +102,7 @@ def test_one_frame_in_a_wrong_place_is_no_move() -> None:
 
 def test_the_checks_are_told_by_writing(tmp_path: object) -> None:
     told: list[str] = []
-    recording.write(_set(IN_ORDER[1:]), f"{tmp_path}/out", told=told.extend)
+    recording.write(_set(IN_ORDER[1:]), f"{tmp_path}/out", report_warnings=told.extend)
     assert any("moved by one row" in line for line in told)
     assert any("moved by one row" in line for line in recording.read(f"{tmp_path}/out").warnings)
 

@@ -456,3 +456,55 @@ def test_a_summary_that_frames_do_not_determine_is_refused_again(small_set: Call
             one.once("boards", refused)
     assert len(tried) == 1
     assert pickle.loads(pickle.dumps(one)).summaries == Summaries()
+
+
+# --- frames with masked pixels and overscan ---------------------------------------------------------------------------
+
+MARGINS = {"masked_rows": [2, 0], "overscan_rows": [0, 3], "overscan_cols": [0, 4]}
+
+
+def _with_margins(small_set: Callable[..., RecordingSet], margins: dict[str, Any]) -> RecordingSet:
+    """Return the small set whose frames have margins of code 5 around the same images."""
+    plain = small_set()
+    document = plain.manifest.model_dump(mode="json", exclude_unset=True)
+    for camera in document["cameras"].values():
+        camera["margins"] = margins
+    manifest = Manifest.model_validate(document)
+    sheet = manifest.cameras["left"]
+    frames = {c.frame: sheet.margins.surround(plain.frame(c), 5, 5) for c in plain.captures()}
+    return plain.under(manifest).with_frames(frames)
+
+
+def test_a_frame_is_its_active_area_and_the_whole_is_kept(
+    small_set: Callable[..., RecordingSet], tmp_path: Path
+) -> None:
+    plain, wide = small_set(), _with_margins(small_set, MARGINS)
+    again = read(write(wide, tmp_path / "set"))
+    assert again.warnings == ()
+    assert json.loads((tmp_path / "set" / "manifest.json").read_text())["cameras"]["left"]["margins"] == MARGINS
+    for capture in plain.captures():
+        np.testing.assert_array_equal(again.frame(capture), plain.frame(capture))
+        whole = again.whole_frame(capture)
+        assert whole.shape == again.camera(capture.side).frame_shape
+        assert np.all(whole[-3:] == 5)
+        assert np.all(whole[:, -4:] == 5)
+        assert again.codes(capture).every.mean_dn == plain.codes(capture).every.mean_dn
+
+
+def test_a_frame_without_its_margins_is_the_active_area(small_set: Callable[..., RecordingSet]) -> None:
+    plain = small_set()
+    wide = _with_margins(small_set, MARGINS).with_frames({c.frame: plain.frame(c) for c in plain.captures()})
+    capture = plain.captures()[0]
+    np.testing.assert_array_equal(wide.whole_frame(capture), plain.frame(capture))
+
+
+def test_frames_of_another_shape_and_margins_that_shift_the_mosaic_are_refused(
+    small_set: Callable[..., RecordingSet],
+) -> None:
+    wide = _with_margins(small_set, MARGINS)
+    capture = wide.captures()[0]
+    off = wide.with_frames({capture.frame: wide.whole_frame(capture)[1:]})
+    with pytest.raises(InputError, match=r"with the margins; recapture, or correct rows and cols, or margins"):
+        off.frame(capture)
+    with pytest.raises(ValueError, match="1 rows and 0 columns before the active area shift the colour filters"):
+        _with_margins(small_set, {"masked_rows": [1, 0]})

@@ -29,15 +29,22 @@ X = np.linspace(0.0, 1.0, POINTS)
 @pytest.mark.parametrize("positive", [True, False])
 @pytest.mark.parametrize("width", [0.01, 1.0, 1000.0])
 @pytest.mark.parametrize("signal", [-5.0, 0.0, 4.0, 20.0])
-def test_an_amplitude_is_integrated_as_by_quadrature(signal: float, width: float, positive: bool) -> None:
-    """log integral exp(signal x - x^2 / 2) p(x) dx, p Student's t of this width. Quadrature about a strong mode takes
-    the prior's logarithm as smooth, which leaves 1 / signal^2 at most."""
+@pytest.mark.parametrize("smaller", [1.0, 0.01])
+def test_an_amplitude_is_integrated_as_by_quadrature(
+    signal: float, width: float, positive: bool, smaller: float
+) -> None:
+    """log integral exp(signal x - x^2 / 2) p(x) dx, p Student's t of this width, half of it of a smaller one.
+    Quadrature about a strong mode takes the prior's logarithm as smooth, which leaves 1 / signal^2 at most."""
     top = max(signal if positive else abs(signal), 0.0)
-    edges = sorted({0.0, width, 10.0 * width, 0.5, max(top - 6.0, 0.0), top, top + 6.0, top + 12.0})
+    edges = sorted({
+        0.0, smaller * width, 10.0 * smaller * width, width, 10.0 * width, 0.5, max(top - 6.0, 0.0), top, top + 6.0,
+        top + 12.0,
+    })  # fmt: skip
     edges = [e for e in edges if e <= top + 12.0]
 
     def density(x: float, sign: float) -> float:
-        return float(np.exp(sign * signal * x - 0.5 * x * x - 0.5 * top**2) * student_t.pdf(x / width, 3) / width)
+        prior = np.mean([student_t.pdf(x / (s * width), 3) / (s * width) for s in (1.0, smaller)])
+        return float(np.exp(sign * signal * x - 0.5 * x * x - 0.5 * top**2) * prior)
 
     parts = [
         quad(density, a, b, args=(s,), limit=200)[0]
@@ -45,7 +52,8 @@ def test_an_amplitude_is_integrated_as_by_quadrature(signal: float, width: float
         for s in ((1.0,) if positive else (1.0, -1.0))
     ]
     exact = np.log((2.0 if positive else 1.0) * sum(parts)) + 0.5 * top**2
-    found = amplitude_log_odds(np.array([signal]), np.ones(1), np.array([width]), np.array([positive]))[0]
+    one = np.ones(1)
+    found = amplitude_log_odds(signal * one, one, width * one, np.array([positive]), smaller * one)[0]
     assert found == pytest.approx(exact, abs=0.01)
 
 
@@ -131,3 +139,25 @@ def test_a_law_that_is_wrong_by_more_than_it_declares_is_inexact(bend: float, in
     posterior = read_table(Search(toy, hypotheses, SetPrior({"line": "lines"})).run(), hypotheses)
     assert [f.name for f in posterior.named] == ["line"]
     assert (posterior.inexact["line"] > 0.5) == inexact
+
+
+def test_two_others_are_found_in_the_place_of_an_inexact_member() -> None:
+    """A line and a wave of 60 and 30 standard deviations, and `both`, a law that changes the numbers by the sum of
+    equal ones: alone it is wrong by a third of its change, three times its tolerance. From it, the right pair is an
+    exchange of one for two."""
+    laws = {
+        "line": lambda u: 60.0 * u[0] * (X + 0.2),
+        "wave": lambda u: 60.0 * u[0] * np.sin(9.0 * X),
+        "both": lambda u: 60.0 * u[0] * (X + 0.2 + np.sin(9.0 * X)),
+    }
+    noise = np.random.default_rng(3).standard_normal(POINTS)
+    value = laws["line"](np.ones(1)) + laws["wave"](np.array([0.5])) + noise
+    hypotheses = {name: linear(name, f"{name}s", 1.0) for name in laws}
+    toy = InexactToy(value, laws, np.zeros((POINTS, 0)))
+    search = Search(toy, hypotheses, SetPrior({name: h.family for name, h in hypotheses.items()}))
+    search.fit({})
+    assert search.fit({"both": Point(np.array([0.7]))}).inexact > 0.5
+    assert search._exchange()
+    assert search._log_posterior(search.fits[frozenset(("line", "wave"))]) == search._top()
+    assert search.fits[frozenset(("line", "wave"))].inexact < 0.5
+    assert not search._exchange()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -20,17 +22,22 @@ from tests.lab.inference.toys import Toy, linear, shaped
 @pytest.mark.parametrize(
     ("precision", "slope"), [(4.0, 1.0), (4.0, -3.0), (100.0, 50.0), (25.0, -40.0), (400.0, 4000.0)]
 )
-def test_one_amplitude_at_its_bound_is_integrated_as_by_quadrature(precision: float, slope: float) -> None:
-    """Of exp(slope u - precision u^2 / 2) p(u) over u >= 0, p a half Student t. The tails are cut at 6 standard
-    deviations, which leaves 1e-4 at most."""
-    c = Coordinate("size", 1.0, lower=0.0)
+@pytest.mark.parametrize("smaller", [1.0, 0.1, 0.01])
+def test_one_amplitude_at_its_bound_is_integrated_as_by_quadrature(
+    precision: float, slope: float, smaller: float
+) -> None:
+    """Of exp(slope u - precision u^2 / 2) p(u) over u >= 0, p a half Student t, half of it of a smaller scale. The
+    tails are cut at 6 standard deviations, which leaves 1e-4 at most."""
+    c = Coordinate("size", 1.0, lower=0.0, smaller=smaller)
     top = max(slope, 0.0) ** 2 / 2.0 / precision
 
     def density(u: float) -> float:
         return float(np.exp(slope * u - 0.5 * precision * u * u - top + float(c.log_prior(u))))
 
     middle = max(slope / precision, 0.0) + 3.0 / np.sqrt(precision)
-    exact = np.log(quad(density, 0.0, middle)[0] + quad(density, middle, np.inf)[0]) + top
+    edges = sorted({0.0, smaller, 6.0 * smaller, middle})
+    parts = [quad(density, a, b)[0] for a, b in pairwise([*edges, np.inf])]
+    exact = np.log(sum(parts)) + top
     u = max(slope / precision, 0.0)
     away = integrate(np.array([[precision]]), np.array([slope - precision * u]), [c], np.array([u])).log_integral
     assert away + slope * u - 0.5 * precision * u * u == pytest.approx(exact, abs=2e-3)
@@ -65,9 +72,11 @@ def test_a_flat_shape_that_nothing_determines_costs_nothing() -> None:
     assert integrate(np.zeros((1, 1)), np.zeros(1), [c], np.array([3.3])).log_integral == pytest.approx(0.0, abs=1e-3)
 
 
-def test_a_size_that_nothing_determines_costs_nothing() -> None:
+@pytest.mark.parametrize("smaller", [1.0, 0.1, 0.01])
+@pytest.mark.parametrize("lower", [0.0, -np.inf])
+def test_a_size_that_nothing_determines_costs_nothing(smaller: float, lower: float) -> None:
     """A normal distribution cut at 6 standard deviations misses 1.4 % of Student's t."""
-    c = Coordinate("size", 2.0, lower=0.0)
+    c = Coordinate("size", 2.0, lower=lower, smaller=smaller)
     assert integrate(np.zeros((1, 1)), np.zeros(1), [c], np.array([0.1])).log_integral == pytest.approx(0.0, abs=0.02)
 
 

@@ -153,6 +153,20 @@ def test_all_transfers_at_once_are_shorts_model(release_px: float) -> None:
     assert np.abs(law.clock(frame) - plain.clock(frame)).max() > 2.0
 
 
+@pytest.mark.parametrize("level_e", [np.full(60, 1000.0), np.linspace(2000.0, 500.0, 60)])
+@pytest.mark.parametrize("release_px", [0.6, 3.0])
+def test_overscan_behind_traps_that_packets_fill_is_shorts_model(release_px: float, level_e: FloatArray) -> None:
+    """Exactly; and of traps whose transfers act one by one n loss N in all lines of even light, whatever the release:
+    the extended pixel edge response. 40 lines miss exp(-40 / 3) = 2e-6 of it."""
+    frame = np.pad(np.repeat(level_e[:, None], 3, axis=1), ((0, 40), (0, 0)))
+    law = Trails(0, 2e-4, ((1.0, release_px),), "first", at_once=True)
+    wanted = filled_at_once(frame, 2e-4, release_px)
+    np.testing.assert_allclose(law.clock(frame, (0, 40))[60:], wanted[60:], rtol=1e-9, atol=1e-12)
+    one_by_one = Trails(0, 2e-4, ((0.4, release_px), (0.6, 0.2)), "first")
+    even = one_by_one.clock(np.pad(np.full((60, 3), 1000.0), ((0, 40), (0, 0))), (0, 40))[60:]
+    assert even[:, 0].sum() == pytest.approx(2e-4 * 60 * 1000.0, rel=1e-5)
+
+
 @pytest.mark.parametrize("mean_e", [9.0, 4000.0])
 @pytest.mark.parametrize("release_px", [0.6, 2.5])
 def test_noise_of_traps_that_packets_fill(release_px: float, mean_e: float) -> None:

@@ -108,3 +108,17 @@ def test_other_measurements_of_even_light_know_how_lines_scatter(variant: int) -
         former(3401, LineGainLaw(0.8, variant, 5), cfa="RGGB"), measure_flat_field, measure_green_balance
     )
     assert sigmas(model, (one,)) < 4.0 < sigmas(model)
+
+
+def test_pixels_of_large_images_are_judged_by_a_part_of_each_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """White noise of 2 with lines of 0.3, 600 pixels by 200 lines, on light that shades by 10 %: the lines' power is
+    that by all pixels, and the pixels' power by 150 of each line is 4 within three standard deviations."""
+    rng = np.random.default_rng(6)
+    image = 2.0 * rng.standard_normal((600, 200)) + 0.3 * rng.standard_normal(200)
+    image += 100.0 - 10.0 * np.linspace(-1.0, 1.0, 600)[:, None] ** 2
+    lines, _ = line_gains._powers(image, "columns")
+    monkeypatch.setattr(line_gains, "BAND_PIXELS", 30_000)
+    same, pixels = line_gains._powers(image, "columns")
+    np.testing.assert_allclose(same, lines, rtol=1e-9)
+    modes = line_gains._share_and_modes("columns", 200)[1] * 2.0 * len(line_gains._along(150))
+    assert np.all(np.abs(pixels / 4.0 - 1.0) < 3.0 / np.sqrt(modes))

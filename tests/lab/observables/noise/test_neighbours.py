@@ -38,7 +38,7 @@ from sim.frame import Exposure, dark_electrons, expected_electrons, read_out
 from sim.scene.scenes import Darkness, UniformField
 from sim.sensor.electrons import FixedPattern, sample_from
 from sim.spectrum import Spectrum
-from tests.lab.diagnose.on_blocks import former, measured_model, sigmas
+from tests.lab.diagnose.on_blocks import dataset, former, measured_model, rendered, sigmas
 from tests.lab.inference.on_blocks import judged as search_blocks
 
 SETS = 400  # of frames
@@ -140,8 +140,8 @@ def test_correlations_of_a_filter_are_its_autocorrelation() -> None:
 def test_noise_of_healthy_cameras_is_what_the_covariances_say(cfa: str) -> None:
     """chi2 of both formers' cameras over their numbers: 3 sigma of 2 / n is 0.4 for 100 numbers; never above by
     more."""
-    for dataset in (_concealed(770011, cfa=cfa), _concealed(770012, cfa=cfa, repeats=6), _rendered((), cfa=cfa)):
-        for block in (measure_noise(dataset), measure_noise_neighbours(dataset)):
+    for looked_at in (_concealed(770011, cfa=cfa), _concealed(770012, cfa=cfa, repeats=6), _rendered((), cfa=cfa)):
+        for block in (measure_noise(looked_at), measure_noise_neighbours(looked_at)):
             residual = block.value - block.predict(()).mean
             jacobian = np.array(list(block.predict(()).jacobian.values())).reshape(-1, len(residual))
             covariance = block.covariance + jacobian.T @ jacobian
@@ -304,6 +304,33 @@ def test_charge_that_moves_across_an_edge_is_no_blur(cfa: str) -> None:
     assert std is not None
     assert abs(found - 5.0) < 3.0 * std
     assert sigmas(model, fit.effects) < 3.0 < sigmas(model)
+
+
+def test_hot_pixels_take_nothing_from_the_correlation_of_the_others() -> None:
+    """Noise x_i of which each pixel passes the share a to the next has the correlation a (1 - a) / ((1 - a)^2 + a^2).
+    One pixel in a hundred of 500 DN and a noise of 40 DN has 2.8 times the variance of all others together; left out,
+    it takes the pairs that it is in, a fiftieth. Of N pairs, a correlation scatters by 1 / sqrt(N)."""
+    rng, share, std_dn, frames = np.random.default_rng(8), 0.2, 3.0, 12
+    plain = rendered(5, repeats=1)
+    darks = [c for c in plain.captures("dark") if c.exposure_s == 2.0]
+    darks = [darks[0].model_copy(update={"id": f"d{k}", "frame": f"d{k}.npy"}) for k in range(frames)]
+    hot = rng.random((96, 128)) < 0.01
+    drawn = {}
+    for capture in darks:
+        noise = std_dn * rng.standard_normal((96, 129))
+        passed = (1.0 - share) * noise[:, 1:] + share * noise[:, :-1]
+        drawn[capture.frame] = np.rint(140.0 + passed + hot * (500.0 + 40.0 * rng.standard_normal(hot.shape)))
+    manifest = plain.manifest.model_copy(update={"captures": (*plain.manifest.captures, *darks)})
+    recordings = plain.under(manifest).with_frames({path: frame.astype(np.uint16) for path, frame in drawn.items()})
+    found = repeats_of(dataset(recordings), darks, held_out=False)
+    wanted = share * (1.0 - share) / ((1.0 - share) ** 2 + share**2)
+    # rounding adds 1/12 DN^2 of its own to the variance of 6.1 DN^2
+    wanted /= 1.0 + 1.0 / 12.0 / (std_dn**2 * ((1.0 - share) ** 2 + share**2))
+    pairs = (frames - 1) * hot.size
+    assert found.correlation[0] == pytest.approx(wanted, abs=wanted * 0.02 + 4.0 / np.sqrt(pairs))
+    black_dn = dataset(recordings).noise.black
+    assert found.ordinary["Y"] == pytest.approx(140.0 - black_dn, abs=4.0 * std_dn / np.sqrt(frames * hot.size) + 0.01)
+    assert found.signal["Y"] == pytest.approx(140.0 - black_dn + 500.0 * hot.mean(), abs=1.0)
 
 
 def test_capacitance_is_named_by_the_evidence_with_its_size() -> None:

@@ -1,0 +1,1 @@
+"""Summaries of the masked pixels and the overscan of dark frames and flats."""
