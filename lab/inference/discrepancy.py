@@ -31,10 +31,10 @@ from sim.effects.screen_gamma import ScreenGamma
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
-#: Change of a node for the differences: small, so that they are derivatives; of factors 0.1 %. What acts by its square
+#: Change of a node for the differences: small, so that they are derivatives; of factors 0.01 %. What acts by its square
 #: (shading on the power of rows) has a slope of 0 where it is absent; by steps of 1 % it had a hundredth of that at 1,
-#: which let flats' rows decide on the shading.
-_STEP = 0.001
+#: which let flats' rows decide on the shading. And that of the borders of a screen's cells.
+_STEP, _STEP_OF_BORDERS = 0.0001, 0.01
 #: Correlation length of a process in nodes.
 _NODES_CORRELATED = 2.0
 #: Distance of the nodes of the transmittance, nm, and their correlation length in nodes: coatings ripple with periods
@@ -254,6 +254,11 @@ class StateCurve:
     everyday: float = 1.0
 
     @property
+    def step(self) -> float:
+        """Change of a node by which the prediction is differenced."""
+        return _STEP
+
+    @property
     def nodes(self) -> int:
         """Number of values."""
         return self.period or self.curves * (len(self.at) - self.fixed - self.is_closed)
@@ -325,6 +330,11 @@ class BordersCurve(StateCurve):
     """The exponent of a screen's light by its drive, at widths `at` of the borders of cells, px."""
 
     @property
+    def step(self) -> float:
+        """Of 1 %: with the exponent, a border's width begins to act, which the shortest step would hold for a slope."""
+        return _STEP_OF_BORDERS
+
+    @property
     def none(self) -> float:
         """The exponent that changes nothing."""
         return 1.0
@@ -340,7 +350,7 @@ def _on_state(model: MeasurementModel, base: FloatArray, curves: Iterable[StateC
     steps = [curve for curve in curves if curve.is_step]
     coordinates = len(curves) - len(steps) + bool(steps)
     for curve in curves:
-        own = [(model.mean((curve.law(_STEP * one),)) - base) / _STEP for one in np.eye(curve.nodes)]
+        own = [(model.mean((curve.law(curve.step * one),)) - base) / curve.step for one in np.eye(curve.nodes)]
         table = np.column_stack(own)
         if table.any():
             factor = np.asarray(np.linalg.cholesky(curve.kernel), float)

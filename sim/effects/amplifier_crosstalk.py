@@ -110,6 +110,12 @@ class AmplifierCrosstalk(Effect):
             for order in ORDERS
         )
 
+    def log_prior(self) -> float:
+        # What couples two amplifiers, a supply or two wires, couples both ways with one sign: d is c at most, to a
+        # tenth and to 0.02 %. With d alone areas have other gains and share no noise: that is taps.
+        over = max(abs(self.excess_percent) - abs(self.share_percent), 0.0)
+        return -0.5 * (over / (0.1 * abs(self.share_percent) + 0.02)) ** 2
+
     def coupling(self) -> FloatArray:
         """Return the shares (areas, areas) that the first index takes over from the second."""
         down, across = LAYOUTS[self.layout]

@@ -82,3 +82,12 @@ def test_no_share_is_no_law_and_the_other_form_couples_read_noise() -> None:
     assert AmplifierCrosstalk().on_signal(Signal(CAMERA)) == Signal(CAMERA)
     (other,) = AmplifierCrosstalk(share_percent=1.0).other_forms()
     assert other.noise == "coupled"
+
+
+def test_both_ways_couple_with_one_sign() -> None:
+    """Shares c + d and c - d of one sign cost nothing; opposite ones, of which areas differ in gain alone, cost 24
+    standard deviations: 0.48 % over 0.02 %."""
+    for excess in (-2.0, 0.0, 1.0, 2.0):
+        assert AmplifierCrosstalk(share_percent=-2.0, excess_percent=excess).log_prior() == 0.0
+    assert AmplifierCrosstalk(share_percent=0.0, excess_percent=0.5).log_prior() < -(24.0**2) / 2.0
+    assert AmplifierCrosstalk(share_percent=0.5, excess_percent=0.52).log_prior() > -0.1

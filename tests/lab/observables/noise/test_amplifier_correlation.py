@@ -12,12 +12,16 @@ from evaluation.independent_simulator.laws import (
     OnChipSmoothingLaw,
     PinkNoiseLaw,
     RowNoiseLaw,
+    TapGainLaw,
 )
 from lab.errors import NotDetermined
+from lab.observables.flats.field import measure_flat_field
+from lab.observables.flats.linearity import measure_photon_transfer
 from lab.observables.noise.amplifier_correlation import RELATIONS, measure_amplifier_correlation
 from sim.effects.base import Effect
 from sim.effects.library import effect
 from tests.lab.diagnose.on_blocks import dataset, former, measured_model, sigmas
+from tests.lab.inference.on_blocks import judge
 from tests.lab.mono_session import MonoSession
 
 
@@ -68,3 +72,12 @@ def test_small_frames_are_skipped_and_every_relation_pairs_all_pixels() -> None:
         assert not np.any(here == there)
     with pytest.raises(NotDetermined, match=r"frames of 24 px.*from 32 px"):
         measure_amplifier_correlation(dataset(MonoSession(shape=(24, 64), levels=4).recordings()))
+
+
+@pytest.mark.parametrize(
+    ("law", "name"), [(TapGainLaw(1.0), "taps"), (AmplifierCrosstalkLaw(4.0, 2, 3), "amplifier_crosstalk")]
+)
+def test_a_step_of_gain_is_told_from_crosstalk_by_what_areas_share(law: Law, name: str) -> None:
+    """Both change the gains of areas; crosstalk lets their noise be alike."""
+    found = judge(former(24, law), measure_flat_field, measure_photon_transfer, measure_amplifier_correlation)
+    assert found.names == [name]
