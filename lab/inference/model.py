@@ -20,6 +20,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, eigh
+from scipy.linalg.lapack import dpotri
 
 from lab.observables.gaussian import Gaussian
 from sim.spectrum import FloatArray
@@ -208,6 +209,7 @@ class ScaleIntegral:
     groups: tuple[Group, ...]
     prior_log: FloatArray  # log prior of u_g = 0 and of u_g = 1, of each group, (2, G)
     _known: dict[bytes, float] = field(default_factory=dict)
+    _known_spectra: dict[bytes, Mapping[int, tuple[FloatArray, FloatArray]]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -319,24 +321,70 @@ class ScaleIntegral:
             t2 = np.square(self.groups[g].scales(True))[:, None]
             yield g, 0.5 * ((t2 / (1.0 + t2 * size)) @ power - np.log1p(t2 * size).sum(1)[:, None])
 
-    def _swept(self, tau: FloatArray, which: Iterable[int], unlisted: frozenset[int]) -> FloatArray:
-        """Return the scales with each of `which` moved to its likeliest point, the others as they are."""
-        tau = tau.copy()
+    def _spectra(self, tau: FloatArray) -> Mapping[int, tuple[FloatArray, FloatArray]]:
+        """Return the eigenvalues of what the others leave of each group's part (Schur complement), and the squares of
+        the residual along its eigenvectors, for all groups that are there at these scales: with A = 1 + D M D, D the
+        amplitudes, group g's block of A^-1 is (1 + tau_g^2 Q)^-1, Q its Schur complement. One factorisation for all."""
+        key = tau.tobytes()
+        if key not in self._known_spectra:
+            amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
+            there = np.flatnonzero(amplitude)
+            scale, split = amplitude[there], len(amplitude) - len(self.precision)
+            inner = scale[:, None] * self.gram[np.ix_(there, there)] * scale
+            inner[np.diag_indices_from(inner)] += np.concatenate([np.ones(split), self.precision])[there]
+            factor = cho_factor(inner, lower=True, check_finite=False)
+            solved = cho_solve(factor, scale * self.projected[there], check_finite=False)
+            inverse = dpotri(factor[0], lower=True)[0]
+            ends = np.cumsum(self.group_sizes)
+            place = np.full(len(amplitude), -1)
+            place[there] = np.arange(len(there))
+            found = {}
+            for g in np.flatnonzero(tau):
+                own = place[ends[g] - self.group_sizes[g] : ends[g]]
+                value, vectors = eigh(inverse[np.ix_(own, own)], lower=True)
+                value = np.clip(value, 1e-300, 1.0)
+                size = (1.0 / value - 1.0) / tau[g] ** 2
+                found[int(g)] = size, np.square(vectors.T @ solved[own] / value / tau[g])
+            self._known_spectra[key] = found
+        return self._known_spectra[key]
+
+    def gains(self, g: int, tau: FloatArray, points: FloatArray) -> FloatArray:
+        """Return what the log marginal likelihood gains with tau_g at each of `points` (k,) in place of its own value,
+        which isn't 0, and the others as they are."""
+        size, power = self._spectra(tau)[g]
+        t2 = np.square(np.append(points, tau[g]))[:, None]
+        values = 0.5 * ((t2 / (1.0 + t2 * size)) @ power - np.log1p(t2 * size).sum(1))
+        return np.asarray(values[:-1] - values[-1])
+
+    def _climb(self, tau: FloatArray, which: Iterable[int], unlisted: frozenset[int]) -> FloatArray:
+        """Return the scales (G,) at a mode along each of the coordinates of `which`: of these that moves which gains
+        most, until none gains."""
+        tau, which = tau.copy(), list(which)
+        log = {g: np.log(self.groups[g].shares(g in unlisted)) for g in which}
+        points = {g: self.groups[g].scales(g in unlisted) for g in which}
         for g in which:
-            points = self.groups[g].scales(g in unlisted)
-            weight = np.log(self.groups[g].shares(g in unlisted))
-            values = self.profile(g, tau, points) if len(points) > 1 else np.zeros(1)
-            tau[g] = points[int(np.argmax(values + weight))]
+            if tau[g] == 0.0:
+                tau[g] = points[g][int(np.argmax(self.profile(g, tau, points[g]) + log[g]))]
+        for _ in range(MOST_MOVES):
+            best, moved = 1e-9, None
+            for g in which:
+                gains = self.gains(g, tau, points[g]) + log[g]
+                now = float(np.interp(tau[g], points[g], log[g]))
+                top = int(np.argmax(gains))
+                if gains[top] - now > best and points[g][top] != tau[g]:
+                    best, moved = float(gains[top] - now), (g, points[g][top])
+            if moved is None:
+                break
+            tau[moved[0]] = moved[1]
         return tau
 
     def integrated(self, tau: FloatArray, unlisted: frozenset[int]) -> float:
         """Log marginal likelihood with every tau integrated over its points, by one-dimensional integrals about
         `tau`, a mode along each coordinate."""
-        at = total = self.log_likelihood(tau)
+        total = self.log_likelihood(tau)
         for g, group in enumerate(self.groups):
             if group.varies(g in unlisted):
-                points, shares = group.scales(g in unlisted), group.shares(g in unlisted)
-                total += log_mean(self.profile(g, tau, points), shares) - at
+                total += log_mean(self.gains(g, tau, group.scales(g in unlisted)), group.shares(g in unlisted))
         return total
 
     @cached_property
@@ -346,10 +394,7 @@ class ScaleIntegral:
     @cached_property
     def everyday_mode(self) -> FloatArray:
         """The likeliest everyday scales (G,)."""
-        tau = everyday_scales(self.groups)
-        for _ in range(2):
-            tau = self._swept(tau, self._everyday_groups, frozenset())
-        return tau
+        return self._climb(everyday_scales(self.groups), self._everyday_groups, frozenset())
 
     @cached_property
     def everyday(self) -> float:
@@ -361,15 +406,15 @@ class ScaleIntegral:
         """Log marginal likelihood with all groups everyday, and what it gains by each group's flip, the scales of the
         others as without: a lower bound of the gain."""
         tau, flips = self.everyday_mode, dict[int, float]()
-        at = everyday = self.log_likelihood(tau)
+        everyday = self.log_likelihood(tau)
         for g, gains in self.profiles_of_processes(tau, self.projected[:, None]):
             flips[g] = log_mean(gains[:, 0], self.groups[g].shares(True))
         for g in self._everyday_groups:
             group = self.groups[g]
             usual, other = group.scales(False), group.scales(True) if group.may_be_unlisted else np.zeros(0)
-            values = self.profile(g, tau, np.concatenate([usual, other]))
+            values = self.gains(g, tau, np.concatenate([usual, other]))
             usual_log = log_mean(values[: len(usual)], group.shares(False))
-            everyday += usual_log - at
+            everyday += usual_log
             if group.may_be_unlisted:
                 flips[g] = log_mean(values[len(usual) :], group.shares(True)) - usual_log
         return everyday, flips
@@ -386,9 +431,9 @@ class ScaleIntegral:
         if not unlisted:
             return self.everyday_mode
         if unlisted not in self._modes:
-            tau = self._swept(self.everyday_mode, sorted(unlisted), unlisted)
-            others = [g for g in self._everyday_groups if g not in unlisted]
-            self._modes[unlisted] = self._swept(self._swept(tau, others, unlisted), sorted(unlisted), unlisted)
+            tau = self._climb(self.everyday_mode, sorted(unlisted), unlisted)
+            every = sorted(unlisted.union(self._everyday_groups))
+            self._modes[unlisted] = self._climb(tau, every, unlisted)
         return self._modes[unlisted]
 
     @cached_property
@@ -405,7 +450,7 @@ class ScaleIntegral:
             if not group.varies(g in unlisted):
                 continue
             points = group.scales(g in unlisted)
-            values = self.profile(g, tau, points)
+            values = self.gains(g, tau, points)
             weight = group.shares(g in unlisted) * np.exp(values - values.max())
             share = (np.cumsum(weight) - 0.5 * weight) / weight.sum()
             found[:, g] = np.interp((rng.permutation(count) + 0.5) / count, share, points)
@@ -464,6 +509,10 @@ class ScaleIntegral:
 #: Groups of which all pairs are tried, and that are tried beside the best; the most that are unlisted; and those with
 #: which the scales of the others are at their mode again.
 PAIRED, MOST_UNLISTED, REFINED = 4, 4, 8
+
+
+#: Moves of the scales to a mode along each coordinate, at most.
+MOST_MOVES = 30
 
 
 def log_mean(values: FloatArray, shares: FloatArray) -> float:

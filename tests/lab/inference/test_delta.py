@@ -114,7 +114,13 @@ def test_flips_of_processes_are_those_of_the_whole_likelihood(everyday: bool) ->
         points = groups[g].scales(True)
         expected = scales.profile(g, tau, points) - scales.log_likelihood(tau)
         np.testing.assert_allclose(gains[:, 0], expected, atol=1e-8)
-        assert scales.mode(frozenset((g,)))[g] in points
+        alone = frozenset((g,))
+        mode = scales.mode(alone)
+        assert mode[g] in points
+        for other in np.flatnonzero(mode):
+            points = groups[other].scales(other in alone)
+            expected = scales.profile(other, mode, points) - scales.log_likelihood(mode)
+            np.testing.assert_allclose(scales.gains(other, mode, points), expected, atol=1e-8)
     assert scales.log_prior(frozenset()) == pytest.approx(np.log(0.95))
     assert np.exp(scales.prior_log[1]).sum() == pytest.approx(0.05)
 
