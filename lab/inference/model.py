@@ -267,8 +267,14 @@ class ScaleIntegral:
         return self.profiles(g, tau, points, self.projected[:, None])[:, 0]
 
     def profiles(self, g: int, tau: FloatArray, points: FloatArray, projected: FloatArray) -> FloatArray:
-        """Return the same (k, m) for m residuals, given their W'r (R + p, m): one factorisation of the others' part,
-        and the eigenvalues of what they leave of group g's (Schur complement)."""
+        """Return the same (k, m) for m residuals, given their W'r (R + p, m)."""
+        size, power, rest = self._left_of(g, tau, projected)
+        t2 = np.square(points)[:, None]
+        return np.asarray(rest + 0.5 * ((t2 / (1.0 + t2 * size)) @ power - np.log1p(t2 * size).sum(1)[:, None]))
+
+    def _left_of(self, g: int, tau: FloatArray, projected: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the eigenvalues (k,) of what the others leave of group g's part (Schur complement), the squares (k, m)
+        of the residuals along its eigenvectors, and the log marginal likelihood (m,) without the group."""
         amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
         ends = np.cumsum(self.group_sizes)
         own = np.zeros(len(amplitude), bool)
@@ -293,9 +299,7 @@ class ScaleIntegral:
             square, b_own = square - across.T @ left, b_own - across.T @ right
             total = 0.5 * np.einsum("ij,ij->j", b, right) - float(np.log(np.diag(factor[0])).sum())
         size, vectors = eigh(square)
-        size, power = np.maximum(size, 0.0), np.square(vectors.T @ b_own)
-        t2 = np.square(points)[:, None]
-        return np.asarray(total + 0.5 * ((t2 / (1.0 + t2 * size)) @ power - np.log1p(t2 * size).sum(1)[:, None]))
+        return np.maximum(size, 0.0), np.square(vectors.T @ b_own), total
 
     def profiles_of_processes(self, tau: FloatArray, projected: FloatArray) -> Iterator[tuple[int, FloatArray]]:
         """Yield each group that is there only where it is unlisted, with its gain of log marginal likelihood at the
@@ -324,7 +328,8 @@ class ScaleIntegral:
     def _spectra(self, tau: FloatArray) -> Mapping[int, tuple[FloatArray, FloatArray]]:
         """Return the eigenvalues of what the others leave of each group's part (Schur complement), and the squares of
         the residual along its eigenvectors, for all groups that are there at these scales: with A = 1 + D M D, D the
-        amplitudes, group g's block of A^-1 is (1 + tau_g^2 Q)^-1, Q its Schur complement. One factorisation for all."""
+        amplitudes, group g's block of A^-1 is (1 + tau_g^2 Q)^-1, Q its Schur complement. One factorisation for all but
+        those whose block of A^-1 is lost in rounding (`LEAST_INVERSE`)."""
         key = tau.tobytes()
         if key not in self._known_spectra:
             amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
@@ -342,8 +347,11 @@ class ScaleIntegral:
             for g in np.flatnonzero(tau):
                 own = place[ends[g] - self.group_sizes[g] : ends[g]]
                 value, vectors = eigh(inverse[np.ix_(own, own)], lower=True)
-                value = np.clip(value, 1e-300, 1.0)
-                size = (1.0 / value - 1.0) / tau[g] ** 2
+                if value[0] < LEAST_INVERSE:
+                    size, power, _ = self._left_of(int(g), tau, self.projected[:, None])
+                    found[int(g)] = size, power[:, 0]
+                    continue
+                size = (1.0 / np.minimum(value, 1.0) - 1.0) / tau[g] ** 2
                 found[int(g)] = size, np.square(vectors.T @ solved[own] / value / tau[g])
             self._known_spectra[key] = found
         return self._known_spectra[key]
@@ -420,11 +428,12 @@ class ScaleIntegral:
         return everyday, flips
 
     @cached_property
-    def quick(self) -> float:
-        """Log marginal likelihood over no and single flips, the scales of the others as without: a lower bound."""
+    def quick(self) -> tuple[float, float]:
+        """Log marginal likelihood and prior with all groups everyday, and summed over single flips, the scales of the
+        others as without: a lower bound."""
         everyday, flips = self._flips
         priors = [gain + self.log_prior(frozenset((g,))) for g, gain in flips.items()]
-        return everyday + log_sum_exp([self.log_prior(frozenset()), *priors])
+        return everyday + self.log_prior(frozenset()), everyday + log_sum_exp(priors)
 
     def mode(self, unlisted: frozenset[int]) -> FloatArray:
         """The likeliest scales (G,) with these groups unlisted."""
@@ -511,6 +520,8 @@ class ScaleIntegral:
 PAIRED, MOST_UNLISTED, REFINED = 4, 4, 8
 
 
+#: Smallest eigenvalue of a block of an inverse, whose rounding is 1e-16, that is known to 1e-8.
+LEAST_INVERSE = 1e-8
 #: Moves of the scales to a mode along each coordinate, at most.
 MOST_MOVES = 30
 

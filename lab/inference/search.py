@@ -106,23 +106,33 @@ ALTERNATIVES_NEAR, MOST_ALTERNATIVES = 4.0, 2
 @dataclass(frozen=True)
 class FormFit:
     """A fitted set with the form errors of its laws at one scale, whose log prior is `log_prior`: log p(y | A) with the
-    groups at their median everyday scales (`base`), and the marginal likelihood of these scales, `start_log` there."""
+    groups at their median everyday scales (`base`), and the marginal likelihood of these scales, `start_log` there.
+
+    `correction`: what `base` has beyond the linear problem. Where that is much, the point is no mode, and what the
+    parameters gain there the groups would take: flips have `HALFWAY` of it at most."""
 
     form: float
     log_prior: float
     base: float
     scales: ScaleIntegral
     start_log: float
+    correction: float
+
+    @property
+    def _taken(self) -> float:
+        return max(self.correction - HALFWAY, 0.0)
 
     @cached_property
     def quick(self) -> float:
         """Log p(y | A), flips with the scales of the others as without: a lower bound, near enough to rank sets."""
-        return self.base - self.start_log + self.scales.quick
+        none, singles = self.scales.quick
+        return self.base - self.start_log + log_sum_exp([none, singles - self._taken])
 
     @cached_property
     def by_groups(self) -> Mapping[frozenset[int], float]:
         """Log p(y | A, u) p(u), by which groups are unlisted: all single flips and the best pairs."""
-        return {u: self.base + w - self.start_log for u, w in self.scales.weights().items()}
+        weights = self.scales.weights().items()
+        return {u: self.base + w - self.start_log - (self._taken if u else 0.0) for u, w in weights}
 
 
 @dataclass(frozen=True)
@@ -630,7 +640,9 @@ class Search:
                 bare, y - mean, self.model.groups, jacobian[:, free], precision[free], pull[free], self.any_unlisted
             )
             base = own + gaussian.log_likelihood(y) + laplace.log_integral
-            fits.append(FormFit(form.share, form.log_prior, base, integral, integral.log_likelihood(at)))
+            start_log = integral.log_likelihood(at)
+            correction = base - own - bare.log_likelihood(y) - start_log
+            fits.append(FormFit(form.share, form.log_prior, base, integral, start_log, correction))
             return laplace
 
         for form in forms:
@@ -974,8 +986,8 @@ class Search:
         none = frozenset[int]()
         ratio = self._averaged_over_scales(scales, none, gram, range(len(self._signatures)))
         gains = gains_of(np.array([ratio[i] for i in range(len(ratio))]), self.hypotheses, self._signatures)
-        flips = float(np.exp(scales.quick - scales.everyday - scales.log_prior(none)))
-        return 1.0 / (flips + float(others_over_empty(gains, self.prior)))
+        everyday, singles = scales.quick
+        return 1.0 / (1.0 + float(np.exp(singles - everyday)) + float(others_over_empty(gains, self.prior)))
 
     # --- the table ---------------------------------------------------------------------------------------------------
 
