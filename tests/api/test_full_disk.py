@@ -19,6 +19,11 @@ from tests.api.conftest import Running, served, serving, until, until_state
 from tests.lab import fake_bench
 from tests.small_disk import fill, small_disk
 
+#: HDF5 flushes where an object of a file is dropped, which can't raise; the next call of the file does.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:Exception ignored in. 'h5py._objects.ObjectID.__dealloc__':pytest.PytestUnraisableExceptionWarning"
+)
+
 DARKS = {"station": "fakes", "quick": True, "sequences": ["dark"]}
 
 

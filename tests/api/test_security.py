@@ -75,6 +75,8 @@ ROUTES = [
     ("GET", "/recordings/{recordings_id}/findings", "read"),
     ("GET", "/recordings", "read"),
     ("POST", "/recordings", "calibrate"),
+    ("POST", "/foreign/spectra", "calibrate"),
+    ("POST", "/foreign/table", "calibrate"),
     ("GET", "/recordings/{recordings_id}", "read"),
     ("GET", "/recordings/{recordings_id}/figures", "read"),
     ("GET", "/recordings/{recordings_id}/captures", "read"),
@@ -109,6 +111,8 @@ ROUTES = [
 #: What can't be used as it is sent here: an empty upload, a query without its parameters.
 UNUSABLE = {
     ("POST", "/recordings"),
+    ("POST", "/foreign/spectra"),
+    ("POST", "/foreign/table"),
     ("POST", "/camera-models"),
     ("GET", "/history"),
     ("GET", "/drift"),
