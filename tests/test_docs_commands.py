@@ -53,6 +53,7 @@ NOT_RUN = {
     "docs/how-to/use-a-cluster.md": "a cluster; tests/lab/test_workers.py starts one",
     "docs/how-to/use-a-light-source.md": "a bench; tests/lab/capture/test_lamp_on_bench.py",
     "docs/how-to/use-argyll.md": "an instrument; tests/drivers/spectroradiometer/test_argyll.py",
+    "docs/how-to/use-an-object-store.md": "an object store; tests/lab/formats/test_object_store.py",
     "docs/how-to/use-my-recordings.md": "minutes; tests/lab/formats/importers/test_raw_folder.py",
     "docs/how-to/write-an-extension.md": "installs a package; tests/lab/test_extensions.py",
     "docs/proof-twin.md": "hours: make twin",
