@@ -5,12 +5,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 from lab.errors import InputError
-from lab.formats.camera_file import CameraFile
-from lab.formats.recording_set import DataSheet
-from lab.formats.results import FitResult
+
+if TYPE_CHECKING:
+    from lab.formats.camera_file import CameraFile
+    from lab.formats.recording_set import DataSheet
+    from lab.formats.results import FitResult
 
 #: A CSV of channel means and variances by level, or of channel means by wavelength.
 TableKind = Literal["photon-transfer-table", "spectral-table"]
