@@ -48,7 +48,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Posterior:
-    """What the table says. `named`: effects, and families where no member is. `nothing`: p(no effect, nothing
+    """What the table says. `named`: effects, and families of which another member acts. `nothing`: p(no effect, nothing
     unlisted). `inexact`: of each named effect, p(its law is wrong by more than it declares | the effect acts)."""
 
     findings: tuple[Finding, ...]
@@ -96,11 +96,23 @@ def read_table(table: Table, hypotheses: Mapping[str, Hypothesis]) -> Posterior:
     findings = [Finding(kind, name, min(p, 1.0)) for kind, found in kinds for name, p in found.items()]
     findings.sort(key=lambda f: (-f.probability, f.kind, f.name))
     named = [f for f in findings if f.kind == "effect" and f.probability >= NAMED]
-    held = {hypotheses[f.name].family for f in named}
-    named += [f for f in findings if f.kind == "family" and f.probability >= NAMED and f.name not in held]
+    named += _named_families(table, hypotheses, families, frozenset(f.name for f in named))
     sizes = {f.name: sizes_of(table, hypotheses, f.name) for f in named if f.kind == "effect"}
     inexact = {name: inexact_probability(table, name) for name in sizes}
     return Posterior(tuple(findings), tuple(named), nothing, sizes, table.left, table.is_undecided, inexact)
+
+
+def _named_families(
+    table: Table, hypotheses: Mapping[str, Hypothesis], families: Mapping[str, float], effects: frozenset[str]
+) -> list[Finding]:
+    """Return the families of which a member acts that isn't among the named effects, with that probability."""
+    further: dict[str, float] = {}
+    for row in table.rows:
+        for family in {hypotheses[name].family for name in row.members - effects}:
+            further[family] = further.get(family, 0.0) + row.probability
+    held = {hypotheses[name].family for name in effects}
+    found = [Finding("family", name, further.get(name, 0.0) if name in held else p) for name, p in families.items()]
+    return sorted((f for f in found if f.probability >= NAMED), key=lambda f: (-f.probability, f.name))
 
 
 def inexact_probability(table: Table, name: str) -> float:

@@ -11,7 +11,7 @@ from lab.diagnose.evidence.side_table import SideTable
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.outcome.next_capture import NOTHING, WITH
 from lab.inference.hypotheses import Coordinate
-from lab.inference.posterior import NAMED, Size, parameter_draws, parameter_slice, sizes_of, weights_of_sets
+from lab.inference.posterior import Size, parameter_draws, parameter_slice, sizes_of, weights_of_sets
 from lab.inference.search import FittedSet, Table
 from sim.effects.base import Effect
 from sim.effects.library import effects as library
@@ -69,39 +69,45 @@ class Cause:
 
 
 def causes_of(reading: SideTable) -> tuple[Cause, ...]:
-    """Return the effects that may be named, and the families of which no member is, likeliest first."""
-    found = []
+    """Return the effects that may be named, and the families of which another member acts, likeliest first."""
     posterior = reading.posterior
-    named_families = {reading.family_of(f.name) for f in posterior.named if f.kind == "effect"}
+    named = frozenset(f.name for f in posterior.named if f.kind == "effect")
+    found = []
     for finding in posterior.findings:
-        if finding.probability < LEAST_DESCRIBED or finding.name in reading.statements:
+        is_described = finding.probability >= LEAST_DESCRIBED and finding.name not in reading.statements
+        if finding.kind == "effect" and is_described and weights_of_sets(reading.table, finding.name):
+            alone = frozenset((finding.name,))
+            found.append(_cause(reading, finding.name, finding.name, finding.probability, (), alone))
+    for finding in posterior.named:
+        if finding.kind != "family" or finding.name in reading.statements:
             continue
-        if finding.kind == "effect":
-            members: tuple[tuple[str, float], ...] = ()
-            law = finding.name
-        elif finding.kind == "family" and finding.probability >= NAMED and finding.name not in named_families:
-            members = members_of(reading, finding.name)
-            of_effects = (name for name, _ in members if name not in reading.statements)
-            law = next((name for name in of_effects if weights_of_sets(reading.table, name)), "")
-        else:
-            continue
-        if law and weights_of_sets(reading.table, law):
-            found.append(_cause(reading, finding.name, law, finding.probability, members))
-    return tuple(found)
+        members = members_of(reading, finding.name, named)
+        of_effects = (name for name, _ in members if name not in reading.statements)
+        law = next((name for name in of_effects if weights_of_sets(reading.table, name)), "")
+        if law:
+            every = frozenset(f.name for f in posterior.findings if f.kind == "effect")
+            alternatives = frozenset(n for n in every - named if reading.family_of(n) == finding.name)
+            found.append(_cause(reading, finding.name, law, finding.probability, members, alternatives))
+    return tuple(sorted(found, key=lambda cause: -cause.probability))
 
 
-def members_of(reading: SideTable, family: str) -> tuple[tuple[str, float], ...]:
-    """Return a family's effects with their inclusion probabilities, likeliest first."""
+def members_of(reading: SideTable, family: str, without: frozenset[str] = frozenset()) -> tuple[tuple[str, float], ...]:
+    """Return a family's effects with their inclusion probabilities, likeliest first, `without` those that are named."""
     found = [
         (f.name, f.probability)
         for f in reading.posterior.findings
-        if f.kind == "effect" and reading.search.hypotheses[f.name].family == family
+        if f.kind == "effect" and f.name not in without and reading.search.hypotheses[f.name].family == family
     ]
     return tuple((n, p) for n, p in found if p >= LEAST_LISTED)[:MOST_LISTED]
 
 
 def _cause(
-    reading: SideTable, name: str, law: str, probability: float, members: tuple[tuple[str, float], ...]
+    reading: SideTable,
+    name: str,
+    law: str,
+    probability: float,
+    members: tuple[tuple[str, float], ...],
+    alternatives: frozenset[str],
 ) -> Cause:
     table, hypothesis = reading.table, reading.search.hypotheses[law]
     weights = weights_of_sets(table, law)
@@ -109,8 +115,6 @@ def _cause(
     best = table.fits[members_of_best].given(reading.unlisted_with(members_of_best))
     effect = next(e for e in reading.effects_of(best.state) if e.name == law)
     draws = parameter_draws(table, law)
-    names = {f.name for f in reading.posterior.findings if f.kind == "effect"}
-    alternatives = frozenset(n for n in names if reading.family_of(n) == name) if members else frozenset((law,))
     prior = sum(reading.inclusion_prior[n] for n in alternatives)
     mean = draws.mean(axis=0)
     return Cause(

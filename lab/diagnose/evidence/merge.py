@@ -197,8 +197,10 @@ def _named(found: Sequence[EvidenceFindings]) -> list[_Named]:
     ]
     for findings in found:
         own = [c for c in findings.causes if c.probability >= NAMED and c.name not in shared]
-        effects = {library()[c.name].family.value for c in own if not c.members}
-        named += [_Named((findings.side,), (c,), c.probability) for c in own if not c.members or c.name not in effects]
+        effects = {c.name for c in own if not c.members}
+        # a family stands for what else of it acts than the effects that are named
+        stands = [c for c in own if not effects & {name for name, _ in c.members}]
+        named += [_Named((findings.side,), (c,), c.probability) for c in stands]
     return sorted(named, key=lambda one: -one.probability)
 
 
