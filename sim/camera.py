@@ -31,9 +31,7 @@ class Lens(Frozen):
 
     f_number: Annotated[float, Quantity("1", "working f-number", lower=0.5, upper=64.0)]
     focal_length_mm: Annotated[float | None, Quantity("mm", "focal length", lower=0.1, upper=5000.0)] = None
-    transmittance: Annotated[
-        float, Quantity("1", "transmittance on the axis", lower=0.0, upper=1.0)
-    ] = 1.0
+    transmittance: Annotated[float, Quantity("1", "transmittance on the axis", lower=0.0, upper=1.0)] = 1.0
     imaging: Imaging = DiffractionLimited()
     illumination: Illumination = CosineFourth()
 
@@ -104,7 +102,9 @@ class CameraModel(Frozen):
     bit_depth: Annotated[int, Quantity("bit", "depth of the converter", lower=1, upper=16)]
     black_level_dn: Annotated[float, Quantity("DN", "mean of a dark pixel at zero exposure", lower=0.0)]
     white_level_dn: Annotated[float, Quantity("DN", "highest code of the converter", lower=1.0)]
-    conversion_gain_dn_per_e: Annotated[float, Quantity("DN/e", "overall system gain K: codes per electron at 0 dB", lower=1e-6)]
+    conversion_gain_dn_per_e: Annotated[
+        float, Quantity("DN/e", "overall system gain K: codes per electron at 0 dB", lower=1e-6)
+    ]
     full_well_e: Annotated[float, Quantity("e", "electrons at which the pixel saturates", lower=1.0)]
     read_noise_e: Annotated[float, Quantity("e", "temporal noise of a dark pixel without quantisation", lower=0.0)]
     dark_current_e_per_s: Annotated[float, Quantity("e/s", "mean dark current at the reference temperature", lower=0.0)]
@@ -118,7 +118,12 @@ class CameraModel(Frozen):
     ] = 25.0
     dark_current_doubling_c: Annotated[
         float | None,
-        Quantity("C", "rise in temperature that doubles the dark current; without it the dark current is constant", lower=0.5, upper=100.0),
+        Quantity(
+            "C",
+            "rise in temperature that doubles the dark current; without it the dark current is constant",
+            lower=0.5,
+            upper=100.0,
+        ),
     ] = None
     row_noise_e: Annotated[
         float, Quantity("e", "temporal noise that all pixels of a row share, new in every frame", lower=0.0)
