@@ -113,7 +113,7 @@ def located(folder: Path, name: str, path: str, a_file: bool = True) -> Path:
 
 @dataclass(frozen=True)
 class ForeignFile:
-    """An archive of one file of another program, and what stands beside it."""
+    """An unpacked archive with a file of another program and the files that it names."""
 
     folder: Path
 

@@ -19,6 +19,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh
 from scipy.linalg.lapack import dpotri
 
@@ -250,17 +251,21 @@ class ScaleIntegral:
         """Log marginal likelihood at these scales (G,), up to a constant of the set."""
         key = tau.tobytes()
         if key not in self._known:
-            amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
-            there = np.flatnonzero(amplitude)
-            amplitude = amplitude[there]
-            inner = amplitude[:, None] * self.gram[np.ix_(there, there)] * amplitude
-            split = len(amplitude) - len(self.precision)
-            inner[np.diag_indices_from(inner)] += np.concatenate([np.ones(split), self.precision])
-            b = amplitude * self.projected[there]
-            factor = cho_factor(inner, lower=True, check_finite=False)
+            there, scale, factor = self._factored(tau)
+            b = scale * self.projected[there]
             log_det = 2.0 * float(np.log(np.diag(factor[0])).sum())
             self._known[key] = 0.5 * float(b @ cho_solve(factor, b, check_finite=False)) - 0.5 * log_det
         return self._known[key]
+
+    def _factored(self, tau: FloatArray) -> tuple[NDArray[np.intp], FloatArray, tuple[FloatArray, bool]]:
+        """Return which coefficients are there at these scales, their amplitudes D, and the Cholesky factor of
+        D M D + diag(1, precision)."""
+        amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
+        there = np.flatnonzero(amplitude)
+        scale, split = amplitude[there], len(there) - len(self.precision)
+        inner = scale[:, None] * self.gram[np.ix_(there, there)] * scale
+        inner[np.diag_indices_from(inner)] += np.concatenate([np.ones(split), self.precision])
+        return there, scale, cho_factor(inner, lower=True, check_finite=False)
 
     def profile(self, g: int, tau: FloatArray, points: FloatArray) -> FloatArray:
         """Log marginal likelihood at these scales with tau_g at each of `points` (k,)."""
@@ -332,16 +337,11 @@ class ScaleIntegral:
         those whose block of A^-1 is lost in rounding (`LEAST_INVERSE`)."""
         key = tau.tobytes()
         if key not in self._known_spectra:
-            amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
-            there = np.flatnonzero(amplitude)
-            scale, split = amplitude[there], len(amplitude) - len(self.precision)
-            inner = scale[:, None] * self.gram[np.ix_(there, there)] * scale
-            inner[np.diag_indices_from(inner)] += np.concatenate([np.ones(split), self.precision])[there]
-            factor = cho_factor(inner, lower=True, check_finite=False)
+            there, scale, factor = self._factored(tau)
             solved = cho_solve(factor, scale * self.projected[there], check_finite=False)
             inverse = dpotri(factor[0], lower=True)[0]
             ends = np.cumsum(self.group_sizes)
-            place = np.full(len(amplitude), -1)
+            place = np.full(len(self.projected), -1)
             place[there] = np.arange(len(there))
             found = {}
             for g in np.flatnonzero(tau):
@@ -477,8 +477,8 @@ class ScaleIntegral:
     def weights(self, least: float = 5.0) -> dict[frozenset[int], float]:
         """Log of p(y | A, u) p(u) of no, single and pair flips, and of larger ones about the best. Of flips that are
         more than `least` below the best, and of all but the `REFINED` likeliest, it is that with the scales of the
-        others as without; pairs are of the likeliest groups that aren't, by themselves. The best is extended by what
-        promises most beside it: what a process leaves may be far beyond noise, and yet small beside that process."""
+        others as without; pairs are of the likeliest groups that aren't, by themselves. The best is extended by the
+        groups that promise most in addition: the rest of a process may be far above noise, and a small part of it."""
         none: frozenset[int] = frozenset()
         found = {none: self.everyday + self.log_prior(none)}
         roughly = {g: self.everyday + gain + self.log_prior(frozenset((g,))) for g, gain in self._flips[1].items()}
@@ -503,8 +503,7 @@ class ScaleIntegral:
         return found
 
     def _extended(self, unlisted: frozenset[int], least: float = 3.0) -> list[frozenset[int]]:
-        """Return these groups with one more, of `PAIRED` that promise most beside them, that are at most `least` less
-        likely."""
+        """Return these groups and one more: of those that are at most `least` less likely, the `PAIRED` likeliest."""
         tau, prior = self.mode(unlisted), self.log_prior(unlisted)
         found = {}
         for g, gains in self.profiles_of_processes(tau, self.projected[:, None]):
@@ -515,8 +514,8 @@ class ScaleIntegral:
         return near[:PAIRED]
 
 
-#: Groups of which all pairs are tried, and that are tried beside the best; the most that are unlisted; and those with
-#: which the scales of the others are at their mode again.
+#: Groups of which all pairs are tried, and by which the best set is extended; the most that are unlisted; and those
+#: with which the scales of the others are at their mode again.
 PAIRED, MOST_UNLISTED, REFINED = 4, 4, 8
 
 
